@@ -1,0 +1,158 @@
+"""Messages to bytes and back: msgpack by msgspec, arrays as one extension, checked against their types.
+
+Wire and recording hold the same bytes. Encoding is canonical: equal messages give equal bytes.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import typing
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import numpy as np
+import xxhash
+
+from graph.arrays import Array, ArraySpec, aligned_copy, spec_of
+
+ARRAY_EXTENSION = 1  # the only msgpack extension code in use
+
+_ALLOWED_KINDS = "biufc"
+
+
+class CodecError(ValueError):
+    """A message that does not fit its type, or bytes that are no such message."""
+
+
+def _pack_array(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        if value.dtype.kind not in _ALLOWED_KINDS:
+            raise CodecError(f"arrays of dtype {value.dtype} cannot travel; use numbers or booleans")
+        little = value.dtype.newbyteorder("<")
+        contiguous = np.ascontiguousarray(value, dtype=little)
+        head = msgspec.msgpack.encode((little.str, value.shape))
+        return msgspec.msgpack.Ext(
+            ARRAY_EXTENSION, b"".join((bytes((len(head),)), head, contiguous.reshape(-1).view(np.uint8).data))
+        )
+    if isinstance(value, np.generic):
+        return value.item()
+    raise CodecError(f"a {type(value).__name__} cannot travel in a message")
+
+
+def _unpack_array(code: int, data: memoryview) -> Array:
+    if code != ARRAY_EXTENSION:
+        raise CodecError(f"unknown msgpack extension {code}")
+    split = 1 + data[0]
+    dtype_name, shape = msgspec.msgpack.decode(data[1:split], type=tuple[str, tuple[int, ...]])
+    dtype = np.dtype(dtype_name)
+    if dtype.kind not in _ALLOWED_KINDS:
+        raise CodecError(f"arrays of dtype {dtype} cannot travel")
+    return aligned_copy(data[split:], dtype, shape)
+
+
+_encoder = msgspec.msgpack.Encoder(enc_hook=_pack_array)
+
+Check = Callable[[Any, dict[str, int], str], None]
+
+
+def _array_check(spec: ArraySpec) -> Check:
+    dtype = np.dtype(spec.dtype)
+
+    def check(value: Any, lengths: dict[str, int], where: str) -> None:
+        good = isinstance(value, np.ndarray) and value.dtype == dtype and value.ndim == len(spec.shape)
+        if good:
+            for wanted, length in zip(spec.shape, value.shape, strict=True):
+                good = good and length == (wanted if isinstance(wanted, int) else lengths.setdefault(wanted, length))
+        if not good:
+            given = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+            known = {name: length for name, length in lengths.items() if name in spec.shape}
+            hint = f" with {', '.join(f'{k} = {v}' for k, v in known.items())}" if known else ""
+            raise CodecError(f"{where} wants {spec}{hint}; it was given {given}")
+
+    return check
+
+
+def _check_for(hint: Any) -> Check | None:
+    """Build the array check of one type hint: arrays, structs, and lists, tuples or dicts of them."""
+    origin = typing.get_origin(hint)
+    if origin is typing.Annotated:
+        inner, *metas = typing.get_args(hint)
+        for meta in metas:
+            if (spec := spec_of(meta)) is not None:
+                return _array_check(spec)
+        return _check_for(inner)
+    if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
+        return _check_struct if struct_checks(hint) else None
+    checks = [check for arg in typing.get_args(hint) if (check := _check_for(arg)) is not None]
+    if not checks:
+        return None
+    only = checks[0]
+    if origin in (list, tuple):
+        return lambda value, lengths, where: [only(item, {}, f"{where}[]") for item in value] and None
+    if origin is dict:
+        return lambda value, lengths, where: [only(item, {}, f"{where}{{}}") for item in value.values()] and None
+    # a union: None, or the one kind of array or struct it may hold
+    return lambda value, lengths, where: only(value, lengths, where) if value is not None else None
+
+
+def _check_struct(value: Any, lengths: dict[str, int], where: str) -> None:
+    own: dict[str, int] = {}
+    for name, check in struct_checks(type(value)):
+        check(getattr(value, name), own, f"{where}.{name}")
+
+
+@functools.cache
+def struct_checks(kind: type[msgspec.Struct]) -> tuple[tuple[str, Check], ...]:
+    """List (field, check) of the fields of a struct that hold arrays."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    found = ((name, _check_for(hints[name])) for name in kind.__struct_fields__)
+    return tuple((name, check) for name, check in found if check is not None)
+
+
+def encode(message: msgspec.Struct) -> bytes:
+    """Encode a message. Raises CodecError, naming the field, if an array is not of the declared dtype and shape."""
+    try:
+        _check_struct(message, {}, type(message).__name__)
+        return _encoder.encode(message)
+    except (TypeError, msgspec.MsgspecError) as error:
+        raise CodecError(f"{type(message).__name__}: {error}") from error
+
+
+@functools.cache
+def _decoder(kind: type[msgspec.Struct]) -> msgspec.msgpack.Decoder[Any]:
+    return msgspec.msgpack.Decoder(kind, ext_hook=_unpack_array)
+
+
+def decode(payload: bytes | memoryview, kind: type[msgspec.Struct]) -> Any:
+    """Decode a message of a known type; its arrays are 64-byte aligned and read-only.
+
+    Raises CodecError, naming the field, if the bytes are not such a message.
+    """
+    try:
+        message = _decoder(kind).decode(payload)
+    except (msgspec.MsgspecError, ValueError, TypeError, IndexError) as error:
+        raise CodecError(f"not a {kind.__name__}: {error}") from error
+    _check_struct(message, {}, kind.__name__)
+    return message
+
+
+def digest(payload: bytes) -> bytes:
+    """Return the 16-byte xxh3-128 digest of a payload."""
+    return xxhash.xxh3_128_digest(payload)
+
+
+@functools.cache
+def schema(kind: type[msgspec.Struct]) -> str:
+    """Return the JSON Schema of a message type as canonical text; arrays carry x-dtype, x-shape, x-unit, x-frame."""
+
+    def array_schema(kind: type) -> dict[str, Any]:
+        return {"description": "array"} if kind is np.ndarray else {}
+
+    return json.dumps(msgspec.json.schema(kind, schema_hook=array_schema), sort_keys=True)
+
+
+def type_name(kind: type) -> str:
+    """Return the full name of a message type, the same in every process: `graph.messages.PointCloud`."""
+    return f"{kind.__module__}.{kind.__qualname__}"

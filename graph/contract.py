@@ -1,0 +1,124 @@
+"""What an operator is: a typed Config, typed Outputs, and one on_<port> method for each input."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import types
+import typing
+from collections.abc import Iterator
+from typing import Any, ClassVar
+
+import msgspec
+
+
+class ContractError(TypeError):
+    """A class that is not an operator as the runtime understands it."""
+
+
+class End(msgspec.Struct, frozen=True):
+    """Returned or yielded by an on_ method: this was the last; ends the run if the graph says `end: <this operator>`."""
+
+    reason: str = ""
+
+
+class Summary(dict[str, Any]):
+    """What an operator says at the end: name to number, or name to a dict of numbers."""
+
+
+class Operator:
+    """A deterministic state machine: messages in, messages out; no clock, no socket, no unseeded random number.
+
+    `on_<port>(message)` returns None, one Outputs, End, or an iterator of them. Ports are handled in the order of the
+    class body, base classes first. `on_start` runs at the first stamp, `on_end` once at the end.
+    """
+
+    class Config(msgspec.Struct):
+        """No settings."""
+
+    class Outputs(msgspec.Struct):
+        """No outputs."""
+
+    config: Any
+
+    def __init__(self, config: Any = None) -> None:
+        self.config = type(self).Config() if config is None else config
+
+    def on_start(self) -> Any:
+        return None
+
+    def on_end(self) -> Any:
+        return None
+
+
+class Source(Operator):
+    """An operator without inputs that may touch the world, and is never run again by a replay."""
+
+    def stream(self) -> Iterator[tuple[int, Any]]:
+        """Yield (stamp in nanoseconds, Outputs); stamps increase strictly."""
+        raise NotImplementedError
+
+
+class Sink(Operator):
+    """An operator without outputs that takes the latest of each input and holds back nobody."""
+
+
+RESERVED: tuple[str, ...] = ("start", "end")
+
+
+class Ports(msgspec.Struct, frozen=True):
+    """Inputs and outputs of an operator class, in the order of its body: port to message type."""
+
+    inputs: dict[str, type[msgspec.Struct]]
+    outputs: dict[str, type[msgspec.Struct]]
+
+
+def _message_type(hint: Any, where: str) -> type[msgspec.Struct]:
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        kinds = [kind for kind in typing.get_args(hint) if kind is not types.NoneType]
+        hint = kinds[0] if len(kinds) == 1 else hint
+    if not (isinstance(hint, type) and issubclass(hint, msgspec.Struct)):
+        raise ContractError(f"{where} wants one message type (a msgspec.Struct); it is annotated {hint!r}")
+    return hint
+
+
+@functools.cache
+def ports_of(kind: type[Operator]) -> Ports:
+    """Read the ports of an operator class from its methods and its Outputs. Raises ContractError by name."""
+    name = kind.__qualname__
+    inputs: dict[str, type[msgspec.Struct]] = {}
+    for base in reversed(kind.__mro__):
+        for attribute, method in vars(base).items():
+            port = attribute.removeprefix("on_")
+            if port == attribute or port in RESERVED or not inspect.isfunction(method):
+                continue
+            method = getattr(kind, attribute)
+            try:
+                hints = typing.get_type_hints(method)
+            except NameError as error:
+                raise ContractError(f"{name}.{attribute}: {error}") from error
+            parameters = list(inspect.signature(method).parameters)[1:]
+            if len(parameters) != 1 or parameters[0] not in hints:
+                raise ContractError(f"{name}.{attribute} wants exactly one annotated parameter, the message")
+            inputs[port] = _message_type(hints[parameters[0]], f"{name}.{attribute}")
+    try:
+        hints = typing.get_type_hints(kind.Outputs)
+    except NameError as error:
+        raise ContractError(f"{name}.Outputs: {error}") from error
+    outputs = {field: _message_type(hints[field], f"{name}.Outputs.{field}") for field in kind.Outputs.__struct_fields__}
+    return Ports(inputs, outputs)
+
+
+class Kind:
+    """Names of the three kinds of operators, for messages to people."""
+
+    SOURCE: ClassVar[str] = "source"
+    SINK: ClassVar[str] = "sink"
+    OPERATOR: ClassVar[str] = "operator"
+
+
+def kind_of(kind: type[Operator]) -> str:
+    """Say whether a class is a source, a sink or a plain operator."""
+    if issubclass(kind, Source):
+        return Kind.SOURCE
+    return Kind.SINK if issubclass(kind, Sink) else Kind.OPERATOR
