@@ -214,6 +214,14 @@ class Draft:
                 self.add(fault.path, fault.text, key=fault.key)
             self.graph = _resolve(_pruned(self.data, {fault.path for fault in found}), self.file)
 
+    @classmethod
+    def of(cls, graph: Graph) -> Draft:
+        """Return the draft of a graph that was never a file; its mistakes stand in no line."""
+        draft = cls.__new__(cls)
+        draft.file, draft.mistakes, draft.graph, draft.data = Path(graph.name), [], graph, to_dict(graph)
+        draft._options, draft._tree = {}, None
+        return draft
+
     def mistake(self, path: KeyPath, text: str, *, key: bool = False) -> Mistake:
         """Return a mistake at a path of the file, or at the option that has set it."""
         for end in range(len(path), 0, -1):
