@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import itertools
 import types
 import typing
 from collections.abc import Sequence
@@ -12,8 +13,9 @@ import msgspec
 
 from graph.codec import schema, type_name
 from graph.contract import Operator, Ports, Sink, Source, ports_of
+from graph.durations import duration_text
 from graph.errors import UserError
-from graph.graphfile import TIMER, Draft, Edge, Graph, GraphError, Mistake, duration_text
+from graph.graphfile import TIMER, Draft, Edge, Graph, GraphError, Mistake
 from graph.loading import ConfigError, build_config, load_class
 from graph.messages import Tick
 from graph.suggest import KeyPath, suggestion
@@ -188,7 +190,9 @@ class _Review:
         lockstep = clock.mode == "lockstep"
         written = self.draft.data.get("clock", {})
         if lockstep and isinstance(written, dict) and written.get("duration") is None and written.get("end") is None:
-            text = "a lockstep graph wants an end: clock.duration (such as 60s), or clock.end (an operator that returns End)"
+            text = (
+                "a lockstep graph wants an end: clock.duration (such as 60s) or clock.end (an operator that says End)"
+            )
             self.draft.add(("clock",), text, key=True)
         if clock.end is None:
             return
@@ -202,9 +206,9 @@ class _Review:
             for name, port, edge in feeds:
                 if name == clock.end and edge.delay == 0 and edge.operator != name:
                     text = (
-                        f"undelayed cycle {edge.operator} -> {name} -> {edge.operator}: clock.end names {name}, so every"
-                        f" other operator waits for it at each stamp, yet {name}.{port} waits for {edge.source} of the"
-                        f" same stamp; delay this edge, or end the run otherwise (clock.duration, another operator)"
+                        f"undelayed cycle {edge.operator} -> {name} -> {edge.operator}: clock.end names {name}, so"
+                        f" every other operator waits for it at each stamp, yet {name}.{port} waits for {edge.source}"
+                        f" of the same stamp; delay this edge, or end the run otherwise (clock.duration, another operator)"
                     )
                     self.draft.add(("operators", name, "inputs", port), text)
 
@@ -217,7 +221,7 @@ class _Review:
             if found is None:
                 continue
             cycle = [*found[1], name]
-            told.update(zip(cycle[:-1], cycle[1:], strict=True))
+            told.update(itertools.pairwise(cycle))
             text = f"undelayed cycle {' -> '.join(cycle)}: everyone waits for a message of the same stamp"
             self.draft.add(("operators", name, "inputs", port), f"{text}; give one of these edges a delay")
         seen: set[frozenset[str]] = set()

@@ -10,15 +10,13 @@ operators:
 
 from __future__ import annotations
 
-import functools
-import re
-from collections.abc import Iterable, Iterator, Sequence
-from decimal import Decimal
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
 
+from graph.durations import DURATION, PERIOD, SPAN, duration_text, nanoseconds, timer_period
 from graph.errors import UserError
 from graph.suggest import Fault, KeyPath, faults, given, suggestion, wants
 from graph.yamlfile import Place, Tree, YamlError, dump, read_text
@@ -26,13 +24,8 @@ from graph.yamlfile import Place, Tree, YamlError, dump, read_text
 TIMER = "timer"
 TAKEN = (TIMER, "clock")  # words that no operator can be named: both mean something in a graph or in --set
 
-_NANOSECONDS = {"h": 3_600 * 10**9, "min": 60 * 10**9, "s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
-_FRACTION = r"(\.[0-9]{1,9})?"
-_TIME = "|".join(  # as many digits as 64 bits of ns can hold
-    rf"[0-9]{{1,{19 - len(str(size))}}}{_FRACTION}{unit}" for unit, size in _NANOSECONDS.items()
-)
-_SOME = r"(?=[0-9.]*[1-9])"  # not zero
-_TIMER = rf"timer/{_SOME}([0-9]{{1,9}}{_FRACTION}hz|{_TIME})"
+DEFAULT_QUEUE = 10  # messages that wait in realtime
+
 _NAME = r"[A-Za-z_][A-Za-z0-9_]*"
 
 Level = Literal["full", "digest"]
@@ -49,7 +42,7 @@ class Edge(msgspec.Struct, frozen=True):
     operator: str
     port: str
     delay: int = 0  # ns
-    queue: int | Literal["latest"] = 10
+    queue: int | Literal["latest"] = DEFAULT_QUEUE
 
     @property
     def source(self) -> str:
@@ -95,18 +88,18 @@ class Graph(msgspec.Struct):
 # What may be written in the file. The structs above are what it means.
 
 Duration = Annotated[
-    Annotated[str, msgspec.Meta(pattern=f"^({_TIME})$")] | Annotated[float, msgspec.Meta(ge=0, le=1e9)],
+    Annotated[str, msgspec.Meta(pattern=f"^({DURATION})$")] | Annotated[float, msgspec.Meta(ge=0, le=1e9)],
     wants("a duration such as 100ms, 1.5s or 2min, or a number of seconds"),
 ]
 Span = Annotated[
-    Annotated[str, msgspec.Meta(pattern=f"^{_SOME}({_TIME})$")] | Annotated[float, msgspec.Meta(ge=1e-9, le=1e9)],
+    Annotated[str, msgspec.Meta(pattern=f"^{SPAN}$")] | Annotated[float, msgspec.Meta(ge=1e-9, le=1e9)],
     wants("a duration above zero such as 100ms, 1.5s or 2min, or a number of seconds"),
 ]
 From = Annotated[
     str,
     wants(
         "operator/port (such as simulator/frame) or a timer (such as timer/10hz, timer/0.5hz or timer/100ms)",
-        pattern=f"^({_TIMER}|(?!timer/){_NAME}/{_NAME})$",
+        pattern=f"^(timer/{PERIOD}|(?!timer/){_NAME}/{_NAME})$",
     ),
 ]
 OperatorName = Annotated[
@@ -124,7 +117,7 @@ class EdgeFile(msgspec.Struct, forbid_unknown_fields=True, rename={"source": "fr
 
     source: From
     delay: Annotated[Duration, msgspec.Meta(description="what the edge adds to a stamp; every cycle wants one")] = 0.0
-    queue: Annotated[Queue, wants("a whole number of at least 1, or 'latest'")] = 10
+    queue: Annotated[Queue, wants("a whole number of at least 1, or 'latest'")] = DEFAULT_QUEUE
 
 
 class OperatorFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -263,7 +256,8 @@ class Draft:
                     self.mistakes.append(Mistake(0, 0, str(error), source))
                     continue
                 self.mistakes += [Mistake(0, 0, flaw, source) for _, flaw in (tree.flaws if tree else [])]
-                _put(self.data, path, tree.data if tree else right.strip())
+                if (blocked := _put(self.data, path, tree.data if tree else right.strip())) is not None:
+                    self.mistakes.append(Mistake(0, 0, f"{shown(blocked)} is no mapping", source))
                 self._options[path] = source
 
 
@@ -274,13 +268,14 @@ def shown(path: KeyPath) -> str:
     return ".".join((path[1], *(path[3:] if path[2:3] in (("config",), ("inputs",)) and len(path) > 3 else path[2:])))
 
 
-def _put(data: dict[str, Any], path: KeyPath, value: Any) -> None:
-    for key in path[:-1]:
-        inner = data.get(key)
-        if not isinstance(inner, dict):
-            inner = data[key] = {}
-        data = inner
+def _put(data: dict[str, Any], path: KeyPath, value: Any) -> KeyPath | None:
+    """Put a value into nested mappings; return what stands in the way if it is no mapping."""
+    for depth, key in enumerate(path[:-1], 1):
+        data = data.setdefault(key, {})
+        if not isinstance(data, dict):
+            return path[:depth]
     data[path[-1]] = value
+    return None
 
 
 def _pruned(value: Any, bad: set[KeyPath], path: KeyPath = ()) -> Any:
@@ -314,32 +309,6 @@ def _edge(written: str | dict[str, Any]) -> dict[str, Any] | None:
     return edge | {"operator": operator, "port": port, "delay": nanoseconds(edge.get("delay", 0))}
 
 
-@functools.cache
-def nanoseconds(duration: str | float) -> int:
-    """Convert a duration (`100ms`, `1.5s`, `2min`, or seconds) into ns, rounded to the nearest. Raises ValueError."""
-    if not isinstance(duration, str):
-        return round(Decimal(repr(duration)) * 10**9)
-    if re.fullmatch(_TIME, duration) is None:
-        raise ValueError(f"a duration is such as 100ms, 1.5s or 2min; this is {duration!r}")
-    amount = duration.rstrip("abcdefghijklmnopqrstuvwxyz")
-    return round(Decimal(amount) * _NANOSECONDS[duration.removeprefix(amount)])
-
-
-@functools.cache
-def timer_period(port: str) -> int:
-    """Return the period in ns of a timer's port (`10hz`, `0.5hz`, `100ms`), at least 1. Raises ValueError."""
-    if re.fullmatch(_TIMER, f"{TIMER}/{port}") is None:
-        raise ValueError(f"a timer is such as timer/10hz or timer/100ms; this is {TIMER}/{port}")
-    period = round(10**9 / Decimal(port[:-2])) if port.endswith("hz") else nanoseconds(port)
-    return max(1, period)
-
-
-def duration_text(value: int) -> str:
-    """Write ns as the shortest duration that means exactly them: `100ms`, `90s`, `2min`."""
-    unit = next((unit for unit, size in _NANOSECONDS.items() if value and value % size == 0), "s")
-    return f"{value // _NANOSECONDS[unit]}{unit}"
-
-
 def read_graph(path: str | Path, *, sets: Sequence[str] = (), swaps: Sequence[str] = ()) -> Graph:
     """Read a graph file; classes are not loaded (see `graph.check`). Raises GraphError with all mistakes.
 
@@ -366,7 +335,8 @@ def from_dict(data: dict[str, Any]) -> Graph:
         raise UserError("; ".join(fault.text for fault in found))
     graph = msgspec.convert(data, Graph)
     try:
-        list(timers(graph))
+        for entry in graph.operators.values():
+            _ = [edge.period for edge in entry.inputs.values()]
     except ValueError as error:
         raise UserError(f"the graph's timers: {error}") from error
     return graph
@@ -393,18 +363,10 @@ def _changed(part: msgspec.Struct, default: msgspec.Struct) -> dict[str, Any]:
 
 def _written(edge: Edge) -> str | dict[str, Any]:
     more: dict[str, Any] = {"delay": duration_text(edge.delay)} if edge.delay else {}
-    more |= {"queue": edge.queue} if edge.queue != Edge("", "").queue else {}
+    more |= {"queue": edge.queue} if edge.queue != DEFAULT_QUEUE else {}
     return {"from": edge.source} | more if more else edge.source
 
 
 def json_schema() -> dict[str, Any]:
     """Return the JSON Schema of graph files, for editors."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | msgspec.json.schema(GraphFile)
-
-
-def timers(graph: Graph) -> Iterator[Edge]:
-    """Yield each timer of a graph once, in the order of their first use."""
-    seen: dict[str, Edge] = {
-        edge.port: edge for entry in graph.operators.values() for edge in entry.inputs.values() if edge.period
-    }
-    yield from seen.values()
