@@ -1,0 +1,332 @@
+"""Launch a graph: one process an operator, the router here, a barrier, a live line, and one recording at the end."""
+
+from __future__ import annotations
+
+import os
+import queue
+import secrets
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import IO, Any
+
+import msgspec
+
+from graph.errors import UserError
+from graph.graphfile import Graph
+from graph.merge import merge
+from graph.recording import Run, Verdict
+from graph.run import Paths, describe
+from graph.status import StatusLine
+from graph.threads import environment
+from graph.transport import Sample, Wire, free_port
+from graph.wiring import NodeSpec, wire
+from graph.worker import Boot, Control, State
+
+DRAIN = 5.0  # seconds that a stopped run gets to come to rest
+LEAVE = 10.0  # seconds that a process gets to write its footer and go
+POLL = 0.05  # seconds between two looks at the children
+SILENCE = 0.3  # realtime: seconds without news after which a stopped run whose counts agree is at rest
+
+
+class Outcome(msgspec.Struct):
+    """How a run ended."""
+
+    verdict: Verdict
+    recording: Path
+    sim_seconds: float
+    wall_seconds: float
+    states: dict[str, Any]  # operator: steps, p50_ms, p95_ms, skipped
+
+
+class Child:
+    """One operator's process: its log goes to a file and to the screen."""
+
+    def __init__(self, boot: Boot, threads: int, log: Path, say: Callable[[str], None]) -> None:
+        self.spec, self.incarnation, self.log_path = boot.spec, boot.incarnation, log
+        self.say = say
+        self.process = subprocess.Popen(
+            [sys.executable, "-u", "-m", "graph.worker"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, **environment(threads), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            start_new_session=True,  # Ctrl-C is for the launcher alone
+        )
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(msgspec.json.encode(boot) + b"\n")
+        self.process.stdin.flush()
+        self.reader = threading.Thread(target=self._tee, args=(self.process.stdout,), daemon=True)
+        self.reader.start()
+
+    def _tee(self, stream: IO[bytes]) -> None:
+        with self.log_path.open("ab", buffering=0) as log:
+            for line in stream:
+                log.write(line)
+                self.say(f"[{self.spec.name}] {line.decode(errors='replace').rstrip()}")
+
+    def ended(self) -> int | None:
+        """Return the exit code of a process that is gone."""
+        return self.process.poll()
+
+    def kill(self) -> None:
+        """End the process now, and wait for it."""
+        self.process.kill()
+        self.process.wait()
+
+    def close(self) -> None:
+        """Wait for the last line of the log."""
+        self.reader.join(timeout=2.0)
+
+
+class Launcher:
+    """One run of one graph. Everything below happens in the thread that calls `launch`."""
+
+    def __init__(
+        self,
+        graph: Graph,
+        *,
+        record: Path | None = None,
+        host: str = "127.0.0.1",
+        log_level: str = "warning",
+        command: str = "",
+        quiet: bool = False,
+    ) -> None:
+        self.graph = graph
+        self.specs = wire(graph)
+        self.by_name = {spec.name: spec for spec in self.specs}
+        self.paths = Paths.choose(graph.name, record)
+        self.run = describe(graph, self.specs, command)
+        self.prefix = f"retracer/{secrets.token_hex(4)}"
+        self.endpoint = f"tcp/{host}:{free_port(host)}"
+        self.log_level = log_level
+        self.status = StatusLine([spec.name for spec in self.specs], quiet=quiet)
+        self.children: dict[str, Child] = {}
+        self.shards: list[Path] = []
+        self.ready: set[tuple[str, bool]] = set()
+        self.states: dict[str, State] = {}
+        self.news_at = time.monotonic()
+        self.reasons: list[str] = []
+        self.interrupts = 0
+        self.realtime = graph.clock.mode == "realtime"
+
+    # processes
+
+    def spawn(self, spec: NodeSpec, incarnation: int = 0) -> None:
+        """Start one operator's process."""
+        shard = self.paths.shards / f"{spec.name}.{incarnation}.mcap"
+        boot = Boot(spec, self.endpoint, self.prefix, str(shard), incarnation, self.log_level)
+        self.shards.append(shard)
+        self.children[spec.name] = Child(boot, spec.threads, self.paths.shards / f"{spec.name}.log", self.status.say)
+
+    def _interrupted(self, number: int, frame: FrameType | None) -> None:
+        self.interrupts += 1
+
+    def tell(self, word: Control) -> None:
+        """Say a word to all operators."""
+        self.wire.tell("control", word)
+
+    def listen(self, timeout: float) -> None:
+        """Take in the operators' reports for at most `timeout` seconds, and look after the children."""
+        until = time.monotonic() + timeout
+        while (left := until - time.monotonic()) > 0:
+            try:
+                self._take(self.wire.inbox.get(timeout=left))
+            except queue.Empty:
+                break
+        self._look_after()
+        self.status.show()
+
+    def _take(self, sample: Sample) -> None:
+        kind, _, name = sample.key.partition("/")
+        if kind == "ready" and sample.alive:
+            self.ready.add((name, True))
+            if self.children[name].incarnation > 0:  # brought back: the run is under way
+                self.tell(Control("start", self.origin))
+        elif kind == "state":
+            state = msgspec.msgpack.decode(sample.payload, type=State)
+            self.states[name] = state
+            self.news_at = time.monotonic()
+            self.status.take(name, state.stamp, state.steps, state.durations, state.skipped)
+
+    def _look_after(self) -> None:
+        for name, child in list(self.children.items()):
+            code = child.ended()
+            if code in (None, 0):
+                continue
+            child.close()
+            spec = child.spec
+            how = f"was ended by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"failed (exit code {code})"
+            if self.realtime and spec.restart == "on-failure" and name in {ready for ready, _ in self.ready} and not self.stopping:
+                self.status.say(f"{name} {how}; starting it again")
+                self.spawn(spec, child.incarnation + 1)
+                continue
+            self.reasons.append(f"{name} {how}")
+            raise Failure(f"{name} {how}")
+
+    # phases
+
+    def launch(self) -> Outcome:
+        """Run the graph to its end. Whatever happens, no process is left behind and the shards are merged."""
+        self.paths.shards.mkdir(parents=True)
+        (self.paths.shards / "run.json").write_bytes(msgspec.json.encode(self.run))
+        before = signal.signal(signal.SIGINT, self._interrupted)
+        terminate = signal.signal(signal.SIGTERM, self._interrupted)
+        begin = time.monotonic()
+        self.stopping = False
+        self.origin = 0
+        try:
+            with Wire(self.endpoint, self.prefix, router=True) as self.wire:
+                self.wire.watch("ready/*")
+                self.wire.subscribe("state/*")
+                try:
+                    self._start()
+                    begin = time.monotonic()
+                    self._run()
+                    self._finish()
+                except Failure as failure:
+                    self.status.say(f"stopping: {failure}")
+                finally:
+                    wall = time.monotonic() - begin
+                    for child in self.children.values():
+                        if child.ended() is None:
+                            child.kill()
+                        child.close()
+            return self._merge(wall)
+        finally:
+            signal.signal(signal.SIGINT, before)
+            signal.signal(signal.SIGTERM, terminate)
+            self.status.close()
+
+    def _start(self) -> None:
+        """Start all processes; nothing begins before every one has declared its ports."""
+        for spec in self.specs:
+            self.spawn(spec)
+        names = {spec.name for spec in self.specs}
+        while (waiting := names - {name for name, _ in self.ready}) and not self.interrupts:
+            self.status.phase = f"starting {', '.join(sorted(waiting))} (the first start compiles, for a minute or so)"
+            self.listen(POLL)
+        if self.interrupts:
+            self.reasons.append("it was interrupted before it began")
+            raise Failure("interrupted")
+        self.status.begin()
+        self.origin = time.monotonic_ns()
+        self.tell(Control("start", self.origin))
+
+    def _working(self) -> list[str]:
+        """Name the operators that must come to an end by themselves."""
+        return [spec.name for spec in self.specs if spec.kind != "sink"]
+
+    def _finished(self) -> bool:
+        return all(
+            (state := self.states.get(name)) is not None and state.phase == "finished" for name in self._working()
+        )
+
+    def _run(self) -> None:
+        """Follow the run until it ends by itself, or is stopped."""
+        duration = self.graph.clock.duration
+        while not self._finished():
+            self.listen(POLL)
+            if self.interrupts:
+                self._stop()
+                return
+            if self.realtime:
+                ended = any(state.end is not None for state in self.states.values())
+                if ended or (duration is not None and time.monotonic_ns() - self.origin > duration):
+                    self._stop()
+                    return
+
+    def _stop(self) -> None:
+        """Stop timers and sources, and let what is under way come to rest within DRAIN seconds."""
+        self.stopping = True
+        before = self.interrupts
+        deadline = time.monotonic() + DRAIN
+        self.status.phase = "stopping"
+        if self.realtime:
+            self.tell(Control("stop"))
+            self._await(self._at_rest, deadline, before)
+            self.tell(Control("finish"))
+        else:
+            self.tell(Control("pause"))
+            self._await(lambda: all(self._phase(name) in ("paused", "finished") for name in self._working()), deadline, before)
+            end = max((state.stamp for name, state in self.states.items() if name in self._working()), default=0)
+            self.tell(Control("end", max(end, 0)))
+        self._await(self._finished, deadline + (LEAVE if self.realtime else 0), before)
+
+    def _phase(self, name: str) -> str:
+        state = self.states.get(name)
+        return state.phase if state else "starting"
+
+    def _await(self, condition: Callable[[], bool], deadline: float, interrupts: int) -> None:
+        while not condition():
+            if self.interrupts > interrupts:
+                self.reasons.append("it was interrupted twice and killed")
+                raise Failure("interrupted twice")
+            if time.monotonic() > deadline:
+                busy = [name for name in self._working() if self._phase(name) not in ("finished", "idle", "paused")]
+                self.reasons.append(f"{', '.join(busy) or 'the graph'} did not come to rest in time")
+                raise Failure(self.reasons[-1])
+            self.listen(POLL)
+
+    def _at_rest(self) -> bool:
+        """Say whether a stopped realtime run has nothing under way: all idle, and every edge's counts agree."""
+        if any(self._phase(name) not in ("idle", "finished") for name in self._working()):
+            return False
+        restarted = any(child.incarnation for child in self.children.values())
+        for spec in self.specs:
+            if spec.kind == "sink":
+                continue
+            for edge in spec.inputs:
+                if edge.period is not None:
+                    continue
+                put = self.states[edge.producer].counts[edge.index]
+                if not restarted and self.states[spec.name].received.get(edge.topic, 0) != put:
+                    return False
+        return not restarted or time.monotonic() - self.news_at > SILENCE
+
+    def _finish(self) -> None:
+        """Let every process go: only now, since others may have been reading their memory."""
+        self.stopping = True
+        self.tell(Control("exit"))
+        deadline = time.monotonic() + LEAVE
+        while any(child.ended() is None for child in self.children.values()):
+            if time.monotonic() > deadline:
+                late = [name for name, child in self.children.items() if child.ended() is None]
+                self.reasons += [f"{name} did not leave" for name in late if self.by_name[name].kind != "sink"]
+                return
+            self.listen(POLL)
+
+    def _merge(self, wall: float) -> Outcome:
+        self.status.phase = "merging the shards"
+        self.status.show(force=True)
+        logs = [self.paths.shards / f"{spec.name}.log" for spec in self.specs]
+        shards = [path for path in self.shards if path.exists()]
+        verdict = merge(
+            shards,
+            self.paths.recording,
+            self.run,
+            reasons=self.reasons,
+            wall_seconds=wall,
+            logs=[log for log in logs if log.exists()],
+        )
+        shutil.rmtree(self.paths.shards)
+        return Outcome(verdict, self.paths.recording, verdict.end / 1e9, wall, self.status.statistics())
+
+
+class Failure(Exception):
+    """The run cannot go on; the reason is noted already."""
+
+
+def launch(graph: Graph, **options: Any) -> Outcome:
+    """Run a checked graph in processes of its own. See Launcher for the options."""
+    return Launcher(graph, **options).launch()
+
+
+__all__: Sequence[str] = ["Launcher", "Outcome", "Run", "UserError", "launch"]

@@ -1,0 +1,152 @@
+"""Lockstep: conservative discrete-event simulation of one operator, without threads, sockets or clocks.
+
+The rules are those of Chandy, Misra and Bryant. A message with stamp s arrives over an edge with delay d at s + d.
+Arrivals are handled in the order (arrival, port, sequence), and only once no earlier one can still come. Whoever owns
+a `Lockstep` feeds it messages and marks in any interleaving; what it hands out never depends on the interleaving.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from typing import Any, NamedTuple
+
+from graph.ledger import INFINITY, Mark, Skip
+from graph.wiring import Input, NodeSpec
+
+
+class GapError(RuntimeError):
+    """A message that was announced never came."""
+
+
+class Arrival(NamedTuple):
+    """Something to handle: its order, and its content."""
+
+    time: int  # s + d, nanoseconds: the stamp of the call
+    port: int  # index into the inputs
+    sequence: int
+    incarnation: int
+    payload: bytes | None  # None for a tick, and for an item of a source
+    skipped: tuple[Skip, ...] = ()
+    late: bool = False
+
+
+class _Edge:
+    """What has come over one edge, and how far its producer is."""
+
+    def __init__(self, edge: Input, port: int) -> None:
+        self.edge, self.port = edge, port
+        self.received = 0  # messages, in sequence
+        self.watermark = -1 + edge.delay
+        self.marks: deque[tuple[int, int]] = deque()  # (announced count, watermark) still short of messages
+
+    def mark(self, mark: Mark) -> None:
+        self.marks.append((mark.counts[self.edge.index], mark.watermark))
+        self.settle()
+
+    def settle(self) -> None:
+        while self.marks and self.marks[0][0] <= self.received:
+            self.watermark = max(self.watermark, self.marks.popleft()[1] + self.edge.delay)
+
+    def gap(self) -> str | None:
+        if not self.marks:
+            return None
+        return f"{self.edge.topic} number {self.received} of {self.marks[-1][0]}"
+
+
+class Lockstep:
+    """The schedule of one operator: which arrival may be handled now, and what may be promised to the others."""
+
+    def __init__(self, spec: NodeSpec) -> None:
+        self.spec = spec
+        self.edges = [_Edge(edge, port) for port, edge in enumerate(spec.inputs) if edge.period is None]
+        self.timers = [(port, edge.period, edge.delay) for port, edge in enumerate(spec.inputs) if edge.period is not None]
+        self.pending: list[Arrival] = [Arrival(delay, port, 0, 0, None) for port, _, delay in self.timers]
+        heapq.heapify(self.pending)
+        self.periods = {port: period for port, period, _ in self.timers}
+        self.flow = dict.fromkeys((c for c in spec.consumers if c != spec.name), -1)
+        self.control = INFINITY if spec.end in (None, spec.name) else -1  # how far the operator that ends the run is
+        self.end = INFINITY if spec.duration is None else spec.duration
+        self.started = False
+        self.finished = False
+        self.handled = -1  # stamp of the last call
+        self.stream_stamp = -1 if spec.kind == "source" else INFINITY  # nothing below comes from the own stream
+
+    def deliver(self, topic: str, incarnation: int, sequence: int, stamp: int, payload: bytes) -> None:
+        """Take a message off the wire. Raises GapError if one before it is missing."""
+        for edge in self.edges:
+            if edge.edge.topic != topic:
+                continue
+            if sequence != edge.received:
+                raise GapError(f"{self.spec.name}: {topic} number {edge.received} is missing; number {sequence} came")
+            edge.received += 1
+            heapq.heappush(
+                self.pending, Arrival(stamp + edge.edge.delay, edge.port, sequence, incarnation, payload)
+            )
+            edge.settle()
+
+    def mark(self, operator: str, mark: Mark) -> None:
+        """Take another operator's mark: as its consumer, and as one whose run it may end."""
+        for edge in self.edges:
+            if edge.edge.producer == operator:
+                edge.mark(mark)
+        if operator == self.spec.end and operator != self.spec.name:
+            if mark.end is not None:
+                self.end = min(self.end, mark.end)
+            self.control = max(self.control, mark.watermark)
+
+    def consumer_at(self, operator: str, watermark: int) -> None:
+        """Take a consumer's own watermark, which bounds how far ahead of it this operator may run."""
+        if operator in self.flow:
+            self.flow[operator] = max(self.flow[operator], watermark)
+
+    def offer(self, stamp: int, payload: bytes | None = None) -> None:
+        """Queue the next item of a source's stream; INFINITY says that there are no more."""
+        self.stream_stamp = stamp
+        if stamp < INFINITY:
+            heapq.heappush(self.pending, Arrival(stamp, -1, 0, 0, payload))
+
+    def edges_at(self) -> int:
+        """Return the stamp through which everything that can ever arrive is here."""
+        horizon = min((edge.watermark for edge in self.edges), default=INFINITY)
+        return min(horizon, self.stream_stamp)
+
+    def next(self) -> Arrival | None:
+        """Return the arrival that may be handled now, and forget it; None if there is none yet."""
+        if not self.pending or not self.started:
+            return None
+        time = self.pending[0].time
+        if time > min(self.end, self.edges_at(), self.control):
+            return None
+        if any(watermark < time - self.spec.ahead for watermark in self.flow.values()):
+            return None
+        arrival = heapq.heappop(self.pending)
+        self.handled = time
+        if (period := self.periods.get(arrival.port)) is not None:
+            heapq.heappush(self.pending, arrival._replace(time=time + period, sequence=arrival.sequence + 1))
+        return arrival
+
+    def finish_at(self, stamp: int) -> None:
+        """Let the run end at a stamp: by this operator's own End, or because a person stopped it."""
+        self.end = min(self.end, stamp)
+
+    def complete(self) -> bool:
+        """Say whether everything through the end has been handled, so that on_end may run."""
+        if self.end == INFINITY or self.finished or not self.started:
+            return False
+        if self.pending and self.pending[0].time <= self.end:
+            return False
+        return min(self.edges_at(), self.control) >= self.end
+
+    def watermark(self) -> int:
+        """Return the stamp through which this operator has emitted all it ever will."""
+        if self.finished:
+            return INFINITY
+        if not self.started:
+            return -1
+        horizon = min(self.edges_at(), self.end - 1)
+        return min(horizon, self.pending[0].time - 1) if self.pending else horizon
+
+    def gaps(self) -> list[str]:
+        """Name the messages that were announced and have not come."""
+        return [gap for edge in self.edges if (gap := edge.gap()) is not None]

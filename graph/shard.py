@@ -1,0 +1,78 @@
+"""A shard: what one operator process emitted and did, written where it was born.
+
+Unchunked MCAP, flushed after each call, so that a killed process loses at most the call it was in.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from mcap.writer import IndexType, Writer
+
+from graph.codec import schema, type_name
+from graph.contract import Summary
+from graph.ledger import Step
+from graph.node import Emission
+from graph.wiring import NodeSpec
+
+STEP, SUMMARY = "step", "summary"  # topics beside an operator's own ports: operator/step, operator/summary
+
+LEDGER_SCHEMA = "retracer.Step"
+SUMMARY_SCHEMA = "retracer.Summary"
+
+
+def ledger_schema() -> bytes:
+    """Return the JSON Schema of a step, as it stands in recordings."""
+    return schema(Step).encode()
+
+
+class Shard:
+    """Writes one operator's shard.
+
+    path: the file, which must not exist. types: output port to message type.
+    """
+
+    def __init__(self, path: Path, spec: NodeSpec, types: dict[str, Any], incarnation: int = 0) -> None:
+        self.spec = spec
+        self.stream: io.BufferedWriter = path.open("xb", buffering=1 << 20)
+        self.writer = Writer(self.stream, use_chunking=False, index_types=IndexType.NONE, enable_crcs=False)
+        self.writer.start(profile="retracer-shard", library="retracer")
+        mine = {"operator": spec.name, "incarnation": str(incarnation)}
+        self.writer.add_metadata("retracer.shard", mine)
+        self.channels: dict[str, int] = {}
+        for port, kind in types.items():
+            number = self.writer.register_schema(type_name(kind), "jsonschema", schema(kind).encode())
+            self.channels[port] = self.writer.register_channel(f"{spec.name}/{port}", "msgpack", number, mine)
+        number = self.writer.register_schema(LEDGER_SCHEMA, "jsonschema", ledger_schema())
+        self.channels[STEP] = self.writer.register_channel(f"{spec.name}/{STEP}", "msgpack", number, mine)
+        number = self.writer.register_schema(SUMMARY_SCHEMA, "jsonschema", b'{"type": "object"}')
+        self.channels[SUMMARY] = self.writer.register_channel(f"{spec.name}/{SUMMARY}", "msgpack", number, mine)
+        self.stream.flush()
+
+    def write(self, emissions: Iterable[Emission], step: Step, summary: Summary | None = None) -> None:
+        """Append the messages of one call, then its step; flushed when this returns."""
+        for emission in emissions:
+            if self.spec.record[emission.port] == "full":
+                self.writer.add_message(
+                    self.channels[emission.port],
+                    log_time=emission.stamp,
+                    publish_time=emission.stamp,
+                    sequence=emission.sequence,
+                    data=emission.payload,
+                )
+        if summary is not None:
+            self._add(SUMMARY, step.stamp, 0, msgspec.msgpack.encode(summary))
+        self._add(STEP, step.stamp, step.index, msgspec.msgpack.encode(step))
+        self.stream.flush()
+
+    def _add(self, port: str, stamp: int, sequence: int, data: bytes) -> None:
+        self.writer.add_message(self.channels[port], log_time=stamp, publish_time=stamp, sequence=sequence, data=data)
+
+    def close(self) -> None:
+        """Write the footer."""
+        self.writer.finish()
+        self.stream.close()

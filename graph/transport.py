@@ -1,0 +1,117 @@
+"""Zenoh as the runtime uses it: one session a process, blocking puts, and one queue that one thread drains.
+
+The launcher holds the router; operators are clients. What keeps Zenoh from losing messages silently: BLOCK instead of
+DROP, a lease and a wait_before_close longer than any stall that we tolerate, and one priority for all, so that data
+is never overtaken by the mark that announces it.
+"""
+
+from __future__ import annotations
+
+import queue
+import socket
+import struct
+from types import TracebackType
+from typing import NamedTuple, Self
+
+import msgspec
+import zenoh
+
+STALL = 30  # seconds that a stuck reader may take before its transport is closed
+
+_ENVELOPE = struct.Struct("<IQq")  # incarnation, sequence, stamp
+
+
+class Sample(NamedTuple):
+    """What came in: data (`data/op/port`), a mark, a state, a control word; or a liveliness change."""
+
+    key: str
+    payload: bytes
+    envelope: tuple[int, int, int]  # incarnation, sequence, stamp; zeros where there is none
+    alive: bool = True
+
+
+def free_port(host: str = "127.0.0.1") -> int:
+    """Ask the system for a free TCP port."""
+    with socket.socket() as listener:
+        listener.bind((host, 0))
+        return int(listener.getsockname()[1])
+
+
+def _configuration(mode: str, endpoint: str) -> zenoh.Config:
+    config = zenoh.Config()
+    settings = {
+        "mode": f'"{mode}"',
+        "scouting/multicast/enabled": "false",
+        "scouting/gossip/enabled": "false",
+        ("listen" if mode == "router" else "connect") + "/endpoints": f'["{endpoint}"]',
+        "transport/shared_memory/enabled": "true",
+        "transport/shared_memory/mode": '"init"',
+        "transport/link/tx/lease": str(STALL * 1000),
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": str(STALL * 1_000_000),
+    }
+    if mode == "client":
+        settings["connect/timeout_ms"] = "5000"
+        settings["connect/exit_on_failure"] = "true"
+    for key, value in settings.items():
+        config.insert_json5(key, value)
+    return config
+
+
+class Wire:
+    """A session: puts under a run's prefix, and everything subscribed to in one queue."""
+
+    def __init__(self, endpoint: str, prefix: str, *, router: bool = False) -> None:
+        self.session = zenoh.open(_configuration("router" if router else "client", endpoint))
+        self.prefix = prefix
+        self.inbox: queue.SimpleQueue[Sample] = queue.SimpleQueue()
+        self.publishers: dict[str, zenoh.Publisher] = {}
+        self.tokens: list[zenoh.LivelinessToken] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the session; without it Zenoh's threads keep the process alive."""
+        self.session.close()
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        attachment = sample.attachment
+        envelope = _ENVELOPE.unpack(attachment.to_bytes()) if attachment is not None else (0, 0, 0)
+        key = str(sample.key_expr)[len(self.prefix) + 1 :]
+        self.inbox.put(Sample(key, sample.payload.to_bytes(), envelope, sample.kind == zenoh.SampleKind.PUT))
+
+    def subscribe(self, key: str) -> None:
+        """Let everything put under a key (wildcards allowed) come into the inbox."""
+        self.session.declare_subscriber(f"{self.prefix}/{key}", zenoh.handlers.Callback(self._receive, indirect=False))
+
+    def watch(self, key: str) -> None:
+        """Let liveliness tokens, present and future, come into the inbox."""
+        handler = zenoh.handlers.Callback(self._receive, indirect=False)
+        self.session.liveliness().declare_subscriber(f"{self.prefix}/{key}", handler, history=True)
+
+    def declare_ready(self, name: str) -> None:
+        """Raise the liveliness token that the readiness barrier waits for."""
+        self.tokens.append(self.session.liveliness().declare_token(f"{self.prefix}/ready/{name}"))
+
+    def announce(self, key: str) -> None:
+        """Declare a publisher ahead of its first put."""
+        self.publishers[key] = self.session.declare_publisher(
+            f"{self.prefix}/{key}",
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.DATA,
+            express=True,
+        )
+
+    def put(self, key: str, payload: bytes, envelope: tuple[int, int, int] | None = None) -> None:
+        """Put bytes; blocks while the way is full."""
+        if key not in self.publishers:
+            self.announce(key)
+        attachment = None if envelope is None else _ENVELOPE.pack(*envelope)
+        self.publishers[key].put(payload, attachment=attachment)
+
+    def tell(self, key: str, record: msgspec.Struct) -> None:
+        """Put one of the runtime's own records."""
+        self.put(key, msgspec.msgpack.encode(record))

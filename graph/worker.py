@@ -1,0 +1,380 @@
+"""The process of one operator: `python -m graph.worker`, started by the launcher, told what to be by one line on stdin."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import queue
+import signal
+import sys
+import threading
+import time
+import traceback
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from graph.errors import UserError
+from graph.ledger import INFINITY, Mark, Step
+from graph.lockstep import GapError, Lockstep
+from graph.node import STREAM, Emission, Node, build_operator
+from graph.realtime import Realtime
+from graph.shard import Shard
+from graph.threads import set_threads
+from graph.transport import Sample, Wire
+from graph.wiring import NodeSpec
+
+GAP_PATIENCE = 5.0  # seconds of the consumer's own running time
+STATE_PERIOD = 0.1  # seconds between two reports to the launcher
+FLOW_PARTS = 4  # a consumer reports its watermark upstream each quarter of `ahead`
+
+
+class Boot(msgspec.Struct):
+    """What the launcher tells a new process."""
+
+    spec: NodeSpec
+    endpoint: str
+    prefix: str
+    shard: str
+    incarnation: int = 0
+    log_level: str = "warning"
+
+
+class Control(msgspec.Struct):
+    """A word of the launcher to all operators."""
+
+    kind: Literal["start", "pause", "end", "stop", "finish", "exit"]
+    stamp: int = 0  # start: the start on the monotonic clock; end: the last stamp of the run
+
+
+class State(msgspec.Struct):
+    """An operator's report to the launcher: how far it is, and how long its latest calls took."""
+
+    phase: Literal["running", "paused", "idle", "finished"]
+    stamp: int  # of the last call
+    steps: int
+    durations: tuple[int, ...] = ()  # nanoseconds, of the calls since the last report
+    counts: tuple[int, ...] = ()  # messages put, by output port
+    received: dict[str, int] = msgspec.field(default_factory=dict)  # realtime: by topic
+    end: int | None = None  # this operator's End, where it ends the run
+    skipped: int = 0
+
+
+class Worker:
+    """Owns the wire, the schedule, the node and the shard, and moves bytes between them. One thread but for a source's."""
+
+    def __init__(self, boot: Boot, wire: Wire) -> None:
+        self.boot, self.wire, self.spec = boot, wire, boot.spec
+        set_threads(self.spec.threads)
+        self.node = Node(self.spec, build_operator(self.spec), boot.incarnation)
+        set_threads(self.spec.threads)
+        self.shard = Shard(Path(boot.shard), self.spec, self.node.output_types, boot.incarnation)
+        self.lockstep = Lockstep(self.spec) if self.spec.mode == "lockstep" and self.spec.kind != "sink" else None
+        self.realtime = None if self.lockstep else Realtime(self.spec)
+        self.emissions: list[Emission] = []
+        self.phase: Literal["running", "paused", "idle", "finished"] = "running"
+        self.origin: int | None = None  # the start of the run on the monotonic clock
+        self.closing = False  # realtime: on_end shall run
+        self.leaving = False
+        self.stopping = False
+        self.promised = -1
+        self.flowed = -1
+        self.durations: list[int] = []
+        self.skipped = 0
+        self.own_end: int | None = None
+        self.reported: tuple[object, ...] = ()
+        self.report_at = 0.0
+        self.demand = threading.Semaphore(0)
+        self._subscribe()
+
+    def _subscribe(self) -> None:
+        spec, wire = self.spec, self.wire
+        wire.subscribe("control")
+        for topic in dict.fromkeys(edge.topic for edge in spec.inputs if edge.period is None):
+            wire.subscribe(f"data/{topic}")
+        if self.lockstep is not None:
+            listened = [*spec.producers, *([spec.end] if spec.end not in (None, spec.name) else [])]
+            for name in dict.fromkeys(listened):
+                wire.subscribe(f"mark/{name}")
+            for name in self.lockstep.flow:
+                wire.subscribe(f"flow/{name}")
+            wire.announce(f"mark/{spec.name}")
+            wire.announce(f"flow/{spec.name}")
+        for port in spec.outputs:
+            wire.announce(f"data/{spec.name}/{port}")
+        wire.announce(f"state/{spec.name}")
+        if spec.kind == "source":
+            threading.Thread(target=self._pull, daemon=True).start()
+        wire.declare_ready(spec.name)
+
+    # what comes in
+
+    def _pull(self) -> None:
+        """Fetch the next item of the stream whenever there is demand; runs in its own thread, for drivers that block."""
+        try:
+            while True:
+                self.demand.acquire()
+                stamp = self.node.peek()
+                self.wire.inbox.put(Sample("stream", b"", (0, 0, INFINITY if stamp is None else stamp)))
+                if stamp is None:
+                    return
+        except BaseException:
+            traceback.print_exc()
+            self.wire.inbox.put(Sample("failed", b"", (0, 0, 0)))
+
+    def drain(self, timeout: float | None) -> bool:
+        """Take in what has come, waiting up to `timeout` seconds for the first (0: not at all). Say if anything came."""
+        inbox = self.wire.inbox
+        if timeout and inbox.empty():
+            try:
+                self._take(inbox.get(timeout=timeout))
+            except queue.Empty:
+                return False
+        elif inbox.empty():
+            return False
+        while not inbox.empty():
+            self._take(inbox.get())
+        return True
+
+    def _take(self, sample: Sample) -> None:
+        kind, _, rest = sample.key.partition("/")
+        if kind == "data":
+            incarnation, sequence, stamp = sample.envelope
+            schedule = self.lockstep or self.realtime
+            assert schedule is not None
+            schedule.deliver(rest, incarnation, sequence, stamp, sample.payload)
+        elif kind == "mark" and self.lockstep is not None:
+            self.lockstep.mark(rest, msgspec.msgpack.decode(sample.payload, type=Mark))
+        elif kind == "flow" and self.lockstep is not None:
+            self.lockstep.consumer_at(rest, sample.envelope[2])
+        elif kind == "stream":
+            (self.lockstep or self.realtime).offer(sample.envelope[2])  # type: ignore[union-attr]
+        elif kind == "failed":
+            raise SystemExit(1)
+        elif kind == "control":
+            self._obey(msgspec.msgpack.decode(sample.payload, type=Control))
+
+    def _obey(self, word: Control) -> None:
+        if word.kind == "start":
+            self.origin = word.stamp
+        elif word.kind == "pause":
+            self.phase = "paused"
+            self.report(force=True)
+        elif word.kind == "end":
+            self.phase = "running"
+            if self.lockstep is not None:
+                self.lockstep.finish_at(word.stamp)
+        elif word.kind == "stop":
+            self.stopping = True
+            if self.realtime is not None:
+                self.realtime.stopped = True
+        elif word.kind == "finish":
+            self.closing = True
+        elif word.kind == "exit":
+            self.leaving = True
+
+    # what goes out
+
+    def emit(self, emission: Emission) -> None:
+        """Put a message on the wire, and remember it for the shard."""
+        envelope = (self.boot.incarnation, emission.sequence, emission.stamp)
+        self.wire.put(f"data/{self.spec.name}/{emission.port}", emission.payload, envelope)
+        self.emissions.append(emission)
+
+    def promise(self) -> None:
+        """Tell the neighbours how far this operator is, if that has changed."""
+        assert self.lockstep is not None
+        watermark = self.lockstep.watermark()
+        if watermark <= self.promised:
+            return
+        self.promised = watermark
+        mark = Mark(watermark, tuple(self.node.counts.values()), self.own_end)
+        self.wire.tell(f"mark/{self.spec.name}", mark)
+        if watermark >= self.flowed + self.spec.ahead // FLOW_PARTS:
+            self.flowed = watermark
+            self.wire.put(f"flow/{self.spec.name}", b"", (0, 0, watermark))
+
+    def after(self, step: Step) -> None:
+        """Promise, then write what the call did into the shard."""
+        if self.lockstep is not None:
+            self.promise()
+        summary, self.node.summary = self.node.summary, None
+        self.shard.write(self.emissions, step, summary)
+        self.emissions.clear()
+        self.durations.append(step.wall_duration)
+        self.skipped += len(step.skipped)
+
+    def report(self, *, force: bool = False) -> None:
+        """Tell the launcher the state: at most ten times a second while running, at once when the phase changes."""
+        now = time.monotonic()
+        if not force and now < self.report_at:
+            return
+        schedule = self.lockstep or self.realtime
+        assert schedule is not None
+        received = self.realtime.received if self.realtime else {}
+        facts = (self.phase, self.node.index, self.own_end, tuple(received.values()))
+        if facts == self.reported and not force:
+            return
+        self.reported, self.report_at = facts, now + STATE_PERIOD
+        state = State(
+            self.phase,
+            schedule.handled,
+            self.node.index,
+            tuple(self.durations),
+            tuple(self.node.counts.values()),
+            received,
+            self.own_end,
+            self.skipped,
+        )
+        self.durations.clear()
+        self.wire.tell(f"state/{self.spec.name}", state)
+
+    # the two ways of time
+
+    def run(self) -> None:
+        """Wait for the start, run to the end, and stay until the launcher lets go: others may still read our memory."""
+        while self.origin is None and not self.leaving:
+            self.drain(1.0)
+        if not self.leaving:
+            if self.lockstep is not None:
+                self.run_lockstep(self.lockstep)
+            else:
+                assert self.realtime is not None
+                self.run_realtime(self.realtime)
+        self.phase = "finished"
+        self.report(force=True)
+        while not self.leaving:
+            self.drain(1.0)
+        self.shard.close()
+
+    def run_lockstep(self, schedule: Lockstep) -> None:
+        """Handle every arrival that is due, in order, until complete through the end."""
+        node, starved = self.node, 0.0
+        step = node.start(self.emit)
+        schedule.started = True
+        if self.spec.kind == "source":
+            schedule.stream_stamp = 0
+            self.demand.release()
+        self.after(step)
+        while not self.leaving:
+            self.drain(0)
+            arrival = schedule.next() if self.phase == "running" else None
+            if arrival is not None:
+                starved = 0.0
+                self.pace(arrival.time)
+                if self.leaving:
+                    return
+                step = node.handle(arrival, arrival.time, self.emit)
+                if step.port == STREAM:
+                    self.demand.release()
+                if step.ended is not None and self.spec.end == self.spec.name:
+                    self.own_end = arrival.time
+                    schedule.finish_at(arrival.time)
+                self.after(step)
+                self.report()
+                continue
+            if schedule.complete() and self.phase == "running":
+                break
+            self.promise()
+            self.report()
+            waited = time.thread_time()
+            if not self.drain(0.5 if not schedule.gaps() else 0.1) and schedule.gaps():
+                starved += 0.1 + time.thread_time() - waited
+                if starved > GAP_PATIENCE:
+                    raise GapError(f"{self.spec.name}: never came: {', '.join(schedule.gaps())}")
+        if self.leaving:
+            return
+        step = node.finish(schedule.end, self.emit)
+        schedule.finished = True
+        self.after(step)
+
+    def pace(self, stamp: int) -> None:
+        """Wait until a stamp is due, where the clock says `pace: realtime` and the stamp is born here."""
+        if self.spec.pace == "realtime" and not self.spec.producers:
+            assert self.origin is not None
+            while (ahead := self.origin + stamp - time.monotonic_ns()) > 0 and not self.leaving and self.phase != "paused":
+                self.drain(ahead / 1e9)
+
+    def run_realtime(self, schedule: Realtime) -> None:
+        """Handle what has arrived, the earliest first, until told to finish."""
+        node, origin = self.node, self.origin
+        assert origin is not None
+        self.after(node.start(self.emit))
+        if self.spec.kind == "source":
+            self.demand.release()
+        while not (self.leaving or self.closing):
+            self.drain(0)
+            now = time.monotonic_ns() - origin
+            arrival = schedule.next(now)
+            if arrival is None:
+                if self.stopping:
+                    self.phase = "idle"
+                self.report(force=self.stopping and not self.wire.inbox.empty())
+                self.drain(min(max((schedule.wake() - now) / 1e9, 1e-4), 0.05))
+                continue
+            self.phase = "running"
+            step = node.handle(arrival, arrival.time, self.emit)
+            if step.port == STREAM:
+                self.demand.release()
+            if step.ended is not None and self.spec.end == self.spec.name:
+                self.own_end = arrival.time
+                schedule.stopped = True
+            self.after(step)
+            self.report()
+        self.drain(0)
+        if self.spec.kind == "sink":
+            while (arrival := schedule.next(time.monotonic_ns() - origin)) is not None:
+                self.after(node.handle(arrival, arrival.time, self.emit))
+        self.after(node.finish(schedule.handled, self.emit, schedule.leave()))
+
+
+def _outlive_nobody() -> None:
+    """End this process when the launcher is gone, even if that was killed: its end of our stdin closes."""
+
+    def watch() -> None:
+        while sys.stdin.buffer.raw.read(1):  # type: ignore[attr-defined]
+            pass
+        os._exit(3)
+
+    if sys.platform == "linux":  # also while a long call of native code holds the interpreter
+        ctypes.CDLL(None, use_errno=True).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def read_boot() -> Boot:
+    """Read the one line that the launcher writes, unbuffered, so that the pipe can be watched afterwards."""
+    line = bytearray()
+    while not line.endswith(b"\n"):
+        byte = os.read(0, 65536)
+        if not byte:
+            raise SystemExit(3)
+        line += byte
+    return msgspec.json.decode(line, type=Boot)
+
+
+def main() -> int:
+    """Run one operator to its end. Exit code 0 only then; a traceback goes to stderr."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the launcher
+    boot = read_boot()
+    _outlive_nobody()
+    logging.basicConfig(level=boot.log_level.upper(), format="%(levelname)s %(name)s: %(message)s")
+    try:
+        with Wire(boot.endpoint, boot.prefix) as wire:
+            Worker(boot, wire).run()
+    except UserError as error:
+        print(error, file=sys.stderr)
+        return 2
+    except (Exception, SystemExit):
+        traceback.print_exc()
+        sys.stderr.flush()
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    code = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)  # not even a stuck native thread may keep the process
