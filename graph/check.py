@@ -18,7 +18,7 @@ from graph.errors import UserError
 from graph.graphfile import TIMER, Draft, Edge, Graph, GraphError, Mistake
 from graph.loading import ConfigError, build_config, load_class
 from graph.messages import Tick
-from graph.suggest import KeyPath, suggestion
+from graph.suggest import suggestion
 
 Feed = tuple[str, str, Edge]  # an operator, one of its ports, and what feeds it
 
@@ -102,11 +102,11 @@ class _Review:
     def _look_at_config(self, graph: Graph, name: str, kind: type[Operator]) -> None:
         entry = graph.operators[name]
         try:
-            build_config(kind, entry.config, graph.root, operator=name)
+            if isinstance(self.draft.data["operators"][name].get("config", {}), dict):
+                build_config(kind, entry.config, graph.root, operator=name)
         except ConfigError as error:
-            for key, text in error.mistakes:
-                path: KeyPath = ("operators", name, "config", *(key.split(".") if key else ()))
-                self.draft.add(path, text, key=" is not a known key" in text)
+            for fault in error.faults:
+                self.draft.add(("operators", name, "config", *fault.path), fault.text, key=fault.key)
         outputs = ports_of(kind).outputs
         for port in entry.record if isinstance(entry.record, dict) else ():
             if port not in outputs:
@@ -118,11 +118,12 @@ class _Review:
 
     def _look_at_ports(self, graph: Graph, name: str, kind: type[Operator]) -> None:
         ports, here = ports_of(kind), ("operators", name, "inputs")
+        swap = self.draft.swapped(name)
         written = self.draft.data["operators"][name].get("inputs", {})
         wired = list(written) if isinstance(written, dict) else []
         if issubclass(kind, Source):
             if wired:
-                self.draft.add(here, f"{self._called(name)} is a Source, which takes no inputs", key=True)
+                self.draft.add(swap or here, f"{self._called(name)} is a Source, which takes no inputs", key=True)
             return
         if not ports.inputs:
             text = f"{self._called(name)} has no on_<port> method, so it would never run; only a Source needs none"
@@ -131,16 +132,15 @@ class _Review:
         for port in wired:
             if port not in ports.inputs:
                 text = f"{self._called(name)} has no input '{port}'{suggestion(port, ports.inputs)}"
-                self.draft.add((*here, port), text, key=True)
+                self.draft.add(swap or (*here, port), text, key=True)
         if not isinstance(written, dict):
             return
         optional = optional_inputs(kind)
         missing = [port for port in ports.inputs if port not in wired and port not in optional]
         for port in missing:
             wanted = ports.inputs[port]
-            self.draft.add(
-                here, f"{name}.{port} is not wired; it wants {wanted.__name__}{self._offers(wanted)}", key=True
-            )
+            text = f"{name}.{port} is not wired; it wants {wanted.__name__}{self._offers(wanted)}"
+            self.draft.add(swap or here, text, key=True)
         if not wired and not missing:
             text = f"{name} has no inputs, so it would never run{suggestion('', ports.inputs)}"
             self.draft.add(here, text, key=True)
@@ -158,32 +158,36 @@ class _Review:
         return f", as given by {', '.join(offers)}" if offers else ", which no operator of this graph gives"
 
     def _look_at_edge(self, name: str, port: str, edge: Edge) -> None:
-        here = ("operators", name, "inputs", port)
-        if edge.operator == TIMER:
-            given: type[msgspec.Struct] = Tick
-        else:
-            if edge.operator not in self.names:
-                text = f"{name}.{port} listens to '{edge.source}'; there is no operator '{edge.operator}'"
-                self.draft.add(here, text + suggestion(edge.operator, self.names))
-                return
-            ports = self._ports(edge.operator)
-            if ports is None:
-                return
-            called = self._called(edge.operator)
-            if issubclass(self.kinds[edge.operator], Sink):
-                self.draft.add(here, f"{name}.{port} listens to {called}, a Sink, which has no outputs")
-                return
-            if edge.port not in ports.outputs:
-                text = f"{name}.{port} listens to '{edge.source}'; {called} has no output '{edge.port}'"
-                self.draft.add(here, text + suggestion(edge.port, ports.outputs))
-                return
-            given = ports.outputs[edge.port]
-        own = self._ports(name)
+        own, given = self._ports(name), self._given(name, port, edge)
         wanted = own.inputs.get(port) if own else None
-        if wanted is not None and not same_type(given, wanted):
+        if given is not None and wanted is not None and not same_type(given, wanted):
             alike = given.__name__ == wanted.__name__
             left, right = (type_name(wanted), type_name(given)) if alike else (wanted.__name__, given.__name__)
-            self.draft.add(here, f"{name}.{port} wants {left}; {edge.source} gives {right}")
+            swap = self.draft.swapped(edge.operator) or self.draft.swapped(name)
+            path = swap or ("operators", name, "inputs", port)
+            self.draft.add(path, f"{name}.{port} wants {left}; {edge.source} gives {right}")
+
+    def _given(self, name: str, port: str, edge: Edge) -> type[msgspec.Struct] | None:
+        """Return the type of the messages on an edge, or None and note why there is none."""
+        here = ("operators", name, "inputs", port)
+        if edge.operator == TIMER:
+            return Tick
+        if edge.operator not in self.names:
+            text = f"{name}.{port} listens to '{edge.source}'; there is no operator '{edge.operator}'"
+            self.draft.add(here, text + suggestion(edge.operator, self.names))
+            return None
+        ports = self._ports(edge.operator)
+        if ports is None:
+            return None
+        called, swap = self._called(edge.operator), self.draft.swapped(edge.operator)
+        if issubclass(self.kinds[edge.operator], Sink):
+            self.draft.add(swap or here, f"{name}.{port} listens to {called}, a Sink, which has no outputs")
+        elif edge.port not in ports.outputs:
+            text = f"{name}.{port} listens to '{edge.source}'; {called} has no output '{edge.port}'"
+            self.draft.add(swap or here, text + suggestion(edge.port, ports.outputs))
+        else:
+            return ports.outputs[edge.port]
+        return None
 
     def _look_at_end(self, graph: Graph, feeds: list[Feed]) -> None:
         clock, here = graph.clock, ("clock", "end")
@@ -208,7 +212,7 @@ class _Review:
                     text = (
                         f"undelayed cycle {edge.operator} -> {name} -> {edge.operator}: clock.end names {name}, so"
                         f" every other operator waits for it at each stamp, yet {name}.{port} waits for {edge.source}"
-                        f" of the same stamp; delay this edge, or end the run otherwise (clock.duration, another operator)"
+                        f" of the same stamp; delay this edge, or end the run by clock.duration or another operator"
                     )
                     self.draft.add(("operators", name, "inputs", port), text)
 

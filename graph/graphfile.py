@@ -223,8 +223,15 @@ class Draft:
         place = self._tree.place(path, key=key) if self._tree else Place(0, 0)
         return Mistake(place.line, place.column, text, str(self.file))
 
+    def swapped(self, name: str) -> KeyPath | None:
+        """Return the path of an operator's class if `--swap` has set it."""
+        path = ("operators", name, "run")
+        return path if path in self._options else None
+
     def add(self, path: KeyPath, text: str, *, key: bool = False) -> None:
-        """Note a mistake at a path."""
+        """Note a mistake at a path, unless the file says there what cannot even be read."""
+        if self._tree is not None and path in self._tree.flawed:
+            return
         self.mistakes.append(self.mistake(path, text, key=key))
 
     def _override(self, sets: Sequence[str], swaps: Sequence[str]) -> None:

@@ -15,17 +15,22 @@ import msgspec
 
 from graph.contract import ContractError, Operator, ports_of
 from graph.errors import UserError
-from graph.suggest import faults, suggestion
+from graph.suggest import Fault, faults, suggestion
 
 EXTRAS = {"pybullet": "sim", "pybullet_data": "sim", "embreex": "sim", "rerun": "view", "rerun_bindings": "view"}
 
 
 class ConfigError(UserError):
-    """Settings that an operator does not take: all of them, as (key, sentence)."""
+    """Settings that an operator does not take: all of them."""
 
-    def __init__(self, mistakes: list[tuple[str, str]]) -> None:
-        self.mistakes = mistakes
-        super().__init__("\n".join(text for _, text in mistakes))
+    def __init__(self, found: list[Fault]) -> None:
+        self.faults = found
+        super().__init__("\n".join(fault.text for fault in found))
+
+    @property
+    def mistakes(self) -> list[tuple[str, str]]:
+        """Return (key, sentence) of each; nested keys as `a.b`."""
+        return [(".".join(fault.path), fault.text) for fault in self.faults]
 
 
 def load_class(run: str, root: str | Path | None = None) -> type[Operator]:
@@ -72,9 +77,8 @@ def _load_module(name: str, folders: list[str]) -> Any:
     except ModuleNotFoundError as error:
         missing = error.name or ""
         if name == missing or name.startswith(missing + "."):
-            raise UserError(
-                f"there is no module '{missing}'{suggestion(missing, _modules_near(missing, folders))}"
-            ) from None
+            near = _modules_near(missing, folders)
+            raise UserError(f"there is no module '{missing}'{suggestion(missing, near) if near else ''}") from None
         top = missing.partition(".")[0]
         if top in EXTRAS:
             command = f'pip install "retracer[{EXTRAS[top]}]"'
@@ -87,10 +91,20 @@ def _load_module(name: str, folders: list[str]) -> Any:
 
 
 def _modules_near(missing: str, folders: list[str]) -> list[str]:
-    """List the modules that stand where one was looked for."""
-    parent, dot, _ = missing.rpartition(".")
+    """List the modules beside the one looked for, and those of its name in other packages, within some folders."""
+    parent, dot, name = missing.rpartition(".")
     places = list(getattr(sys.modules.get(parent), "__path__", [])) if parent else folders
-    return [f"{parent}{dot}{module.name}" for module in pkgutil.iter_modules(places)]
+    own = [place for place in places if any(Path(place).is_relative_to(folder) for folder in folders)]
+    found = [f"{parent}{dot}{beside}" for beside in _names_in(own)]
+    if parent:
+        packages = [module.name for module in pkgutil.iter_modules(folders) if module.ispkg and module.name != parent]
+        inside = {package: [str(Path(folder, package)) for folder in folders] for package in packages}
+        found += [f"{package}.{name}" for package in packages if name in _names_in(inside[package])]
+    return found
+
+
+def _names_in(places: list[str]) -> list[str]:
+    return [module.name for module in pkgutil.iter_modules(places)]
 
 
 def _operators_in(module: Any) -> list[str]:
@@ -129,15 +143,14 @@ def build_config(kind: type[Operator], config: dict[str, Any], root: str | Path,
         raise TypeError(f"{value!r} is no {wanted}")
 
     found = list(faults(config, kind.Config, shown=lambda path: ".".join((name, *path)), hook=hook))
-    mistakes = [(".".join(fault.path), fault.text) for fault in found]
-    if not mistakes:
+    if not found:
         try:
             return msgspec.convert(config, kind.Config, dec_hook=hook, str_keys=True)
         except msgspec.ValidationError as error:  # of a __post_init__
-            mistakes = [("", f"{name}: {_said(error)}")]
+            found = [Fault((), f"{name}: {_said(error)}")]
         except (TypeError, ValueError) as error:
-            mistakes = [("", f"{name}: {_one_line(error)}")]
-    raise ConfigError(mistakes)
+            found = [Fault((), f"{name}: {_one_line(error)}")]
+    raise ConfigError(found)
 
 
 def _said(error: Exception) -> str:
@@ -159,5 +172,5 @@ def _paths(value: Any) -> Iterator[Path]:
         for item in value.values():
             yield from _paths(item)
     elif isinstance(value, (list, tuple, set, frozenset)):
-        for item in value:
+        for item in sorted(value, key=str) if isinstance(value, (set, frozenset)) else value:
             yield from _paths(item)

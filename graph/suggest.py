@@ -14,6 +14,7 @@ KeyPath = tuple[str, ...]
 Hook = Callable[[type, Any], Any]
 
 _LISTED = 12  # names; a longer list helps nobody
+_UNIONS = (typing.Union, types.UnionType)
 
 
 class Fault(NamedTuple):
@@ -36,10 +37,11 @@ def suggestion(word: str, known: Iterable[str]) -> str:
     names = sorted(known)
     if not names:
         return "; there are none"
-    shown = ", ".join(names[:_LISTED]) + (f" and {len(names) - _LISTED} more" if len(names) > _LISTED else "")
     meant = nearest(word, names)
-    verb = "is" if len(names) == 1 else "are"
-    return f"; did you mean '{meant}'? There {verb} {shown}" if meant else f"; there {verb} {shown}"
+    if len(names) == 1:
+        return f"; did you mean '{meant}'?" if meant else f"; there is {names[0]}"
+    shown = ", ".join(names[:_LISTED]) + (f" and {len(names) - _LISTED} more" if len(names) > _LISTED else "")
+    return f"; did you mean '{meant}'? There are {shown}" if meant else f"; there are {shown}"
 
 
 def given(value: Any) -> str:
@@ -73,7 +75,7 @@ def wanted(hint: Any) -> str:
         return " ".join([wanted(arguments[0]), *bounds])
     if hint in (None, types.NoneType):
         return "nothing"
-    if origin in (typing.Union, types.UnionType):
+    if origin in _UNIONS:
         return " or ".join(wanted(part) for part in arguments if part is not types.NoneType)
     if origin is typing.Literal:
         return " or ".join(given(choice) for choice in arguments)
@@ -111,7 +113,7 @@ def _branch(value: Any, hint: Any) -> Any:
     """Strip annotations, and choose the one part of a union that a mapping or a list is meant for."""
     while typing.get_origin(hint) is typing.Annotated:
         hint = typing.get_args(hint)[0]
-    if typing.get_origin(hint) not in (typing.Union, types.UnionType):
+    if typing.get_origin(hint) not in _UNIONS:
         return hint
     parts = [_branch(value, part) for part in typing.get_args(hint)]
     if isinstance(value, dict):
@@ -121,6 +123,14 @@ def _branch(value: Any, hint: Any) -> Any:
     else:
         return hint
     return parts[0] if len(parts) == 1 else hint
+
+
+def _without_structs(hint: Any) -> Any:
+    """Leave out of a union what only a mapping could be meant for."""
+    if typing.get_origin(hint) not in _UNIONS:
+        return hint
+    rest = tuple(part for part in typing.get_args(hint) if not _is_struct(part))
+    return typing.Union[rest] if rest else hint  # noqa: UP007
 
 
 def faults(
@@ -134,15 +144,19 @@ def faults(
     origin, arguments = typing.get_origin(branch), typing.get_args(branch)
     if isinstance(value, dict) and _is_struct(branch) and branch.__struct_config__.tag is None:
         yield from _struct_faults(value, branch, path, shown, hook)
-    elif isinstance(value, dict) and origin is dict and value:
+        return
+    inner: list[Fault] = []
+    if isinstance(value, dict) and origin is dict:
         for key, item in value.items():
             if (problem := _problem(key, arguments[0], hook)) is not None:
-                yield Fault((*path, key), f"{shown(path)} wants {problem}; it was given {given(key)}", key=True)
-            yield from faults(item, arguments[1], (*path, key), shown=shown, hook=hook)
+                text = f"{shown(path)} wants {problem}; it was given {given(key)}"
+                inner.append(Fault((*path, key), text, key=True))
+            inner += faults(item, arguments[1], (*path, key), shown=shown, hook=hook)
     elif isinstance(value, list) and origin is list:
         for index, item in enumerate(value):
-            yield from faults(item, arguments[0], (*path, str(index)), shown=shown, hook=hook)
-    elif (problem := _problem(value, hint, hook)) is not None:
+            inner += faults(item, arguments[0], (*path, str(index)), shown=shown, hook=hook)
+    yield from inner
+    if not inner and (problem := _problem(value, hint, hook)) is not None:
         yield Fault(path, f"{shown(path)} wants {problem}; it was given {given(value)}")
 
 
@@ -171,7 +185,7 @@ def _problem(value: Any, hint: Any, hook: Hook | None) -> str | None:
     try:
         msgspec.convert(value, hint, dec_hook=hook, str_keys=True)
     except msgspec.ValidationError:
-        return wanted(hint)
+        return wanted(hint if isinstance(value, (dict, list)) else _without_structs(hint))
     except (TypeError, RecursionError) as error:
         return f"a type that can be configured ({' '.join(str(error).split())})"
     return None

@@ -68,6 +68,7 @@ class Tree:
         self.keys: dict[KeyPath, Place] = {}
         self.values: dict[KeyPath, Place] = {}
         self.flaws: list[tuple[Place, str]] = []
+        self.flawed: set[KeyPath] = set()  # values that could not be read, and are None
         self._open: set[int] = set()  # collections being read, against aliases to themselves
         self._flattened: set[int] = set()
         node = _compose(text)
@@ -95,19 +96,20 @@ class Tree:
                 return _scalar(node)
             except ValueError as error:
                 self._flaw(node, str(error))
+                self.flawed.add(path)
                 return None
         if id(node) in self._open:
             raise YamlError("an alias stands within what it stands for", _place(node.start_mark))
         self._open.add(id(node))
         result: Any
-        if isinstance(node, yaml.SequenceNode):
-            result = [self._read(item, (*path, str(index))) for index, item in enumerate(node.value)]
-        else:
+        if isinstance(node, yaml.MappingNode):
             result = self._read_mapping(node, path)
+        else:
+            result = [self._read(item, (*path, str(index))) for index, item in enumerate(node.value)]
         self._open.discard(id(node))
         return result
 
-    def _read_mapping(self, node: yaml.Node, path: KeyPath) -> dict[str, Any]:
+    def _read_mapping(self, node: yaml.MappingNode, path: KeyPath) -> dict[str, Any]:
         if id(node) not in self._flattened:
             self._flattened.add(id(node))
             self._flatten(node)
@@ -121,7 +123,7 @@ class Tree:
             result[key] = self._read(value_node, (*path, key))
         return result
 
-    def _flatten(self, node: yaml.Node) -> None:
+    def _flatten(self, node: yaml.MappingNode) -> None:
         """Report keys that stand twice, then put in what `<<` merges."""
         seen: dict[str, Place] = {}
         for key_node, _ in node.value:
@@ -152,7 +154,9 @@ def _compose(text: str) -> yaml.Node | None:
 def _problem(error: yaml.MarkedYAMLError) -> str:
     parts = [part for part in (error.context, error.problem) if part]
     tab = "; indent with spaces" if "'\\t'" in (error.problem or "") else ""
-    return f"not YAML: {', '.join(parts)}{tab}"
+    begun, here = error.context_mark, error.problem_mark
+    since = f" (begun in line {begun.line + 1})" if begun and here and begun.line != here.line else ""
+    return f"not YAML: {', '.join(parts)}{since}{tab}"
 
 
 def _place(mark: Any) -> Place:

@@ -245,3 +245,20 @@ class Settings(Operator):
         by_name: dict[str, float] = {}
 
     def on_tick(self, tick: Tick) -> None: ...
+
+
+class Both(Operator):
+    """Listen to two numbers, and pass on the right one."""
+
+    Outputs = CountOutputs
+
+    def on_left(self, count: Count) -> None: ...
+
+    def on_right(self, count: Count) -> CountOutputs:
+        return CountOutputs(count)
+
+
+class Maybe(Operator):
+    """Listen to a number if there is one."""
+
+    def on_count(self, count: Count | None) -> None: ...
