@@ -1,0 +1,135 @@
+"""The floor as the planner sees it: what the map says and what has been seen, how near it is, and what driving there costs."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from operators.navigation.distance import distance_to
+from operators.navigation.footprint import Footprint, Surroundings, inside
+from operators.navigation.lattice import Lattice, lattice_around, moved, resampled, union
+from operators.navigation.obstacles import ObstacleLayer
+from operators.navigation.search import BLOCKED
+
+CELL = 0.05  # metres, of the map and of the local window
+COARSE = 2  # cells of the map along one of the search's
+BLOCK = 160  # cells by which the raster grows: 8 m
+OCCUPIED = 50  # value of a map's cell from which it counts as occupied
+MARGIN = 4.0  # metres of unknown floor kept around all that matters, so that a way can lead around
+
+FREE = 8  # weight of open floor: whole numbers with room for an eighth
+TIGHT = 32  # added to it at the robot's inscribed radius, falling to nothing with the square of the distance
+UNKNOWN = 8  # added where the map knows nothing
+ESCAPE = 160  # weight of cells too near to something, around a robot that stands there anyway
+ESCAPE_RADIUS = 0.6  # metres
+
+
+@njit(cache=True)
+def weigh(
+    distance: npt.NDArray[np.float32],
+    known: npt.NDArray[np.bool_],
+    lethal: float,
+    inflation: float,
+    start: tuple[int, int],
+    escape_cells: float,
+) -> npt.NDArray[np.int32]:
+    """Give each coarse cell its weight: BLOCKED below `lethal` metres, falling to FREE at `inflation`.
+
+    distance, known (rows, columns) on the fine raster; a coarse cell's distance is the mean of its four. Around `start`
+    (coarse row and column) cells that are not themselves occupied are left open at the weight ESCAPE.
+    """
+    rows, columns = distance.shape[0] // COARSE, distance.shape[1] // COARSE
+    weights = np.empty((rows, columns), np.int32)
+    for row in range(rows):
+        for column in range(columns):
+            total, least, seen = 0.0, 1e9, True
+            for down in range(COARSE):
+                for right in range(COARSE):
+                    value = float(distance[COARSE * row + down, COARSE * column + right])
+                    total += value
+                    least = min(least, value)
+                    seen = seen and known[COARSE * row + down, COARSE * column + right]
+            mean = total / (COARSE * COARSE)
+            near = math.sqrt((row - start[0]) ** 2 + (column - start[1]) ** 2) <= escape_cells
+            if mean < lethal:
+                weights[row, column] = ESCAPE if near and least > 0.0 else BLOCKED
+                continue
+            weight = FREE if seen else FREE + UNKNOWN
+            if mean < inflation:
+                closeness = (inflation - mean) / (inflation - lethal)
+                weight += int(TIGHT * closeness * closeness)
+            weights[row, column] = weight
+    return weights
+
+
+class Costmap:
+    """The map's cells and the obstacles seen, on one raster that grows with the world."""
+
+    def __init__(self, *, reach: float = 8.0) -> None:
+        """Start with nothing known. reach: metres around the lidar within which obstacles are entered and removed."""
+        self.lattice = Lattice(CELL, 0, 0, 0, 0)
+        self.cells = np.full((0, 0), -1, np.int8)  # of the map: -1 unknown, 0 free to 100 occupied
+        self.obstacles = ObstacleLayer(self.lattice, reach=reach)
+
+    def cover(self, *positions: tuple[float, float]) -> None:
+        """Grow the raster so that it reaches MARGIN beyond each position (x, y in metres)."""
+        if all(self.lattice.covers(x, y, MARGIN) for x, y in positions):
+            return
+        places = np.array(positions)
+        self._grow(lattice_around(CELL, places.min(axis=0) - MARGIN, places.max(axis=0) + MARGIN, block=BLOCK))
+
+    def _grow(self, wanted: Lattice) -> None:
+        lattice = union(self.lattice, wanted) if self.lattice.rows else wanted
+        if lattice == self.lattice:
+            return
+        self.cells = moved(self.cells, self.lattice, lattice, -1)
+        self.obstacles.grow(lattice)
+        self.lattice = lattice
+
+    def set_map(self, cells: npt.NDArray[np.int8], origin: npt.ArrayLike, resolution: float) -> None:
+        """Replace the map: cells (rows, columns), -1 unknown, 0 free to 100 occupied; origin of its corner in metres."""
+        lower = np.asarray(origin, np.float64)
+        upper = lower + resolution * np.array([cells.shape[1], cells.shape[0]])
+        self._grow(lattice_around(CELL, lower - MARGIN, upper + MARGIN, block=BLOCK))
+        self.cells = resampled(cells, lower, resolution, self.lattice)
+
+    def clear_footprint(self, footprint: Footprint, pose: tuple[float, float, float]) -> None:
+        """Empty what seems to stand where the robot (x, y, yaw) itself stands."""
+        row, column = self.lattice.cell(pose[0], pose[1])
+        reach = math.ceil(footprint.circumscribed / CELL) + 1
+        rows, columns = np.mgrid[row - reach : row + reach + 1, column - reach : column + reach + 1]
+        x, y = self.lattice.centre(rows, columns)
+        taken = inside(footprint, x, y, pose)
+        taken &= (rows >= 0) & (rows < self.lattice.rows) & (columns >= 0) & (columns < self.lattice.columns)
+        where = rows[taken], columns[taken]
+        self.obstacles.erase(*where)
+        self.cells[where] = np.minimum(self.cells[where], 0)
+
+    def occupied(self) -> npt.NDArray[np.bool_]:
+        """Return (rows, columns): the map or the lidar says that something stands there."""
+        return (self.cells >= OCCUPIED) | self.obstacles.filled
+
+    def weights(
+        self, *, lethal: float, inflation: float, robot: tuple[float, float], seen: bool = True
+    ) -> npt.NDArray[np.int32]:
+        """Return the weights of the coarse raster for a search from a robot's position; without what was seen if not `seen`."""
+        taken = self.occupied() if seen else self.cells >= OCCUPIED
+        distance = distance_to(taken, CELL, inflation)
+        start = self.lattice.coarse(COARSE).cell(*robot)
+        return weigh(distance, self.cells >= 0, lethal, inflation, start, ESCAPE_RADIUS / (CELL * COARSE))
+
+    def window(self, x: float, y: float, side: float, limit: float) -> Surroundings:
+        """Return how near things are, up to `limit` metres, in a square of `side` metres around a position."""
+        cells = round(side / CELL)
+        row, column = self.lattice.cell(x, y)
+        top, left = row - cells // 2, column - cells // 2
+        rows = slice(max(top, 0), max(min(top + cells, self.lattice.rows), 0))
+        columns = slice(max(left, 0), max(min(left + cells, self.lattice.columns), 0))
+        taken = np.zeros((cells, cells), np.bool_)  # what lies outside of the raster is empty
+        part = (self.cells[rows, columns] >= OCCUPIED) | self.obstacles.filled[rows, columns]
+        taken[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = part
+        x, y = (left + self.lattice.first_column) * CELL, (top + self.lattice.first_row) * CELL
+        return Surroundings(distance_to(taken, CELL, limit), CELL, x, y)

@@ -1,0 +1,245 @@
+"""The driver: from poses, maps, frames and goals to a velocity ten times a second, and what to do when that fails."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from graph.geometry import Matrix, wrap, yaw
+from operators.navigation.costmap import CELL, COARSE, FREE, Costmap
+from operators.navigation.footprint import Footprint, Surroundings
+from operators.navigation.lattice import Lattice
+from operators.navigation.motion import Commands, Twist, towards
+from operators.navigation.search import UNIT, UNREACHED, Field, cost_to_go, trace
+from operators.navigation.window import STEP, DynamicWindow, Limits, way_around
+
+REPLAN = 5  # periods between two searches
+BEYOND = 3.0  # metres of open floor by which a search goes on past the robot, to cover its window
+ARRIVED = 0.25  # metres from the target at which the robot stops
+NEARBY = 0.75  # metres around a target that is itself blocked: a place there serves, the goal's radius being 0.9
+NEARBY_COST = 3.0  # metres of open floor that each metre from the blocked target counts
+PATIENCE = 120  # periods without any way after which a target is called unreachable
+STILL, STILL_TURN = 0.15, 0.6  # metres and radians: moving less than this
+STILL_FOR = 40  # periods, is being stuck
+ATTEMPTS = 8  # recoveries within FRESH metres after which a target is called unreachable
+FRESH = 1.0  # metres
+REST = 200  # periods after which an unreachable target is tried again
+BLIND_SPEED = 0.4  # m/s at most, while the localizer is not sure
+BRAKE = 2.0  # times the usual acceleration, when every arc ends in something
+
+
+class Decision(NamedTuple):
+    """What to do now, and why."""
+
+    twist: Twist
+    path: npt.NDArray[np.float64]  # (n, 2) metres, world
+    trajectory: npt.NDArray[np.float64]  # (k, 3) x, y, yaw, world
+    status: str  # follow, recover, unreachable, arrived, wait
+
+
+class Recovery:
+    """Motions to get loose with, one after the other; each is left when it would touch something."""
+
+    def __init__(self, attempt: int, turn: float, limits: Limits) -> None:
+        """Plan the motions. attempt: from 0, each does something else; turn: radians to the left to face the way."""
+        back = Twist(-limits.reverse, 0.0)
+        side = math.copysign(0.8 * limits.turn, turn)
+        spin, other = Twist(0.0, side), Twist(0.0, -side)
+        facing = min(round(abs(turn) / (0.8 * limits.turn) / STEP), 40)
+        self.motions: list[tuple[Twist, int]] = [
+            [(back, 12), (spin, facing)],
+            [(spin, facing), (Twist(), 10)],
+            [(back, 20), (other, 20)],
+            [(Twist(), 20), (back, 8), (spin, 20)],
+        ][attempt % 4]
+
+
+class Navigator:
+    """A state machine: tell it the goal, the map and each frame; ask it for a velocity at each pose."""
+
+    def __init__(
+        self,
+        footprint: Footprint | None = None,
+        limits: Limits | None = None,
+        *,
+        padding: float = 0.04,
+        inflation: float = 0.8,
+        side: float = 4.0,
+        horizon: float = 3.0,
+        latency: float = 0.1,
+    ) -> None:
+        """Take lengths in metres and times in seconds.
+
+        padding: kept free around the footprint; inflation: distance up to which the search keeps away from things; side: of the
+        local window; horizon: of the arcs; latency: from a measurement to the effect of the command that answers it.
+        """
+        self.footprint = footprint or Footprint()
+        self.limits = limits or Limits()
+        self.costmap = Costmap()
+        self.commands = Commands(latency)
+        self.window = DynamicWindow(self.footprint, self.limits, horizon=horizon, padding=padding)
+        self._inflation, self._side = inflation, side
+        self._goal: tuple[float, float] | None = None
+        self._field: Field | None = None
+        self._field_lattice = Lattice(CELL * COARSE, 0, 0, 0, 0)
+        self._path = np.empty((0, 2))
+        self._until_replan = 0
+        self._without_way = 0
+        self._trail: deque[tuple[float, float, float]] = deque(maxlen=STILL_FOR)
+        self._recovery: Recovery | None = None
+        self._attempts = 0
+        self._attempt_place = (0.0, 0.0)
+        self._given_up = 0  # periods left of not trying
+
+    def set_goal(self, x: float, y: float) -> None:
+        """Drive to a place (metres, world) from now on."""
+        if self._goal == (x, y):
+            return
+        self._goal = (x, y)
+        self._until_replan = 0
+        self._without_way = self._attempts = self._given_up = 0
+        self._recovery = None
+
+    def set_map(self, cells: npt.NDArray[np.int8], origin: npt.ArrayLike, resolution: float) -> None:
+        """Replace the map: cells (rows, columns) -1 unknown, 0 free to 100 occupied; its corner in metres, world."""
+        self.costmap.set_map(cells, origin, resolution)
+
+    def observe(self, points: npt.NDArray[np.float32], world_from_base: Matrix, base_from_lidar: Matrix) -> None:
+        """Enter a frame: points (n, 3) in the lidar frame, and where the base was when it was taken."""
+        x, y = float(world_from_base[0, 3]), float(world_from_base[1, 3])
+        self.costmap.cover((x, y))
+        floor = float(world_from_base[2, 3])
+        self.costmap.obstacles.observe(points, world_from_base @ base_from_lidar, floor)
+
+    def step(self, measured_at: int, world_from_base: Matrix, *, valid: bool = True) -> Decision:
+        """Decide what to do from a pose measured at a time in nanoseconds; drive carefully when it is not valid."""
+        measured = float(world_from_base[0, 3]), float(world_from_base[1, 3]), yaw(world_from_base)
+        if self._goal is None:
+            return self._decide(measured_at, Twist(), measured, "wait")
+        pose = self.commands.predict(measured_at, *measured)
+        self.costmap.cover(pose[:2], self._goal)
+        self.costmap.clear_footprint(self.footprint, measured)
+        if math.dist(pose[:2], self._goal) < ARRIVED:
+            self._trail.clear()
+            return self._decide(measured_at, Twist(), pose, "arrived")
+        if self._given_up > 0:
+            self._given_up -= 1
+            self._until_replan = 0
+            return self._decide(measured_at, Twist(), pose, "unreachable")
+        if self._until_replan == 0:
+            self._search(pose)
+        self._until_replan -= 1
+        if self._without_way > PATIENCE:
+            return self._decide(measured_at, Twist(), pose, "unreachable")
+        around = self.costmap.window(pose[0], pose[1], self._side, self._side / 4.0)
+        if self._recovery is None and self._stuck(pose):
+            self._recover(pose)
+        if self._recovery is not None:
+            twist = self._get_loose(pose, around)
+            if twist is not None:
+                return self._decide(measured_at, twist, pose, "recover")
+        return self._follow(measured_at, pose, around, BLIND_SPEED if not valid else self.limits.speed)
+
+    def _search(self, pose: tuple[float, float, float]) -> None:
+        """Search from the goal; when what was seen leaves no way, by the map alone: people move on, and doors open."""
+        assert self._goal is not None
+        self._until_replan = REPLAN
+        lattice = self.costmap.lattice.coarse(COARSE)
+        start = lattice.cell(pose[0], pose[1])
+        lethal = self.footprint.inscribed + self.window.padding
+        per_metre = FREE * UNIT / lattice.resolution
+        for seen in (True, False):
+            weights = self.costmap.weights(lethal=lethal, inflation=self._inflation, robot=pose[:2], seen=seen)
+            sources, costs = self._sources(weights, lattice, per_metre)
+            field = cost_to_go(weights, sources, costs, start=start, margin=round(BEYOND * per_metre))
+            found = field.cost[start] != UNREACHED
+            if found:
+                break
+        self._without_way = 0 if found and seen else self._without_way + REPLAN
+        self._field, self._field_lattice = field, lattice
+        cells = trace(field, *start)
+        self._path = np.stack(lattice.centre(cells[:, 0], cells[:, 1]), axis=1)
+
+    def _sources(
+        self, weights: npt.NDArray[np.int32], lattice: Lattice, per_metre: float
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int32]]:
+        """Return the goal's cell, or the open ones near to it when it is blocked, each with what its distance costs."""
+        assert self._goal is not None
+        row, column = lattice.cell(*self._goal)
+        if weights[row, column] > 0:
+            return np.array([row * lattice.columns + column]), np.zeros(1, np.int32)
+        reach = math.ceil(NEARBY / lattice.resolution)
+        rows, columns = np.mgrid[row - reach : row + reach + 1, column - reach : column + reach + 1]
+        x, y = lattice.centre(rows, columns)
+        away = np.hypot(x - self._goal[0], y - self._goal[1])
+        fit = (rows >= 0) & (rows < lattice.rows) & (columns >= 0) & (columns < lattice.columns) & (away <= NEARBY)
+        flat = (rows * lattice.columns + columns)[fit]
+        return flat, np.round(away[fit] * NEARBY_COST * per_metre).astype(np.int32)
+
+    def _stuck(self, pose: tuple[float, float, float]) -> bool:
+        """Say whether the robot has hardly moved for STILL_FOR periods."""
+        self._trail.append(pose)
+        if len(self._trail) < STILL_FOR:
+            return False
+        trail = np.array(self._trail)
+        away = np.hypot(trail[:, 0] - pose[0], trail[:, 1] - pose[1]).max()
+        return bool(away < STILL and np.abs(wrap(trail[:, 2] - pose[2])).max() < STILL_TURN)
+
+    def _recover(self, pose: tuple[float, float, float]) -> None:
+        """Start getting loose, or give up for a while after too many attempts in one place."""
+        if math.dist(pose[:2], self._attempt_place) > FRESH:
+            self._attempts, self._attempt_place = 0, (pose[0], pose[1])
+        if self._attempts == ATTEMPTS:
+            self._attempts, self._given_up = 0, REST
+        ahead = self._path[min(6, len(self._path) - 1)] if len(self._path) else np.array(self._goal)
+        turn = float(wrap(math.atan2(ahead[1] - pose[1], ahead[0] - pose[0]) - pose[2]))
+        self._recovery = Recovery(self._attempts, turn, self.limits)
+        self._attempts += 1
+
+    def _get_loose(self, pose: tuple[float, float, float], around: Surroundings) -> Twist | None:
+        """Return the present motion of the recovery, or None when it is over."""
+        assert self._recovery is not None
+        motions = self._recovery.motions
+        while motions:
+            twist, steps = motions.pop(0)
+            if steps > 0 and self.window.free_steps(pose, twist, around, 3) == 3:
+                motions.insert(0, (twist, steps - 1))
+                return twist
+        self._recovery = None
+        self._until_replan = 0
+        self._trail.clear()
+        return None
+
+    def _follow(
+        self, measured_at: int, pose: tuple[float, float, float], around: Surroundings, top_speed: float
+    ) -> Decision:
+        """Let the dynamic window choose, and come nearer to its choice as fast as the drive can."""
+        assert self._field is not None
+        limits = self.limits
+        now = self.commands.at(measured_at + round(self.commands.latency * 1e9))
+        seconds_per_cost = self._field_lattice.resolution / (FREE * UNIT) / limits.speed
+        way = way_around(self._field, self._field_lattice, pose[0], pose[1], self._side, seconds_per_cost)
+        choice = self.window.choose(pose, now, around, way, top_speed=top_speed)
+        grip = limits.acceleration * STEP * (1.0 if math.isfinite(choice.seconds) else BRAKE)
+        twist = Twist(
+            towards(now.linear, choice.target.linear, grip),
+            towards(now.angular, choice.target.angular, limits.turn_acceleration * STEP),
+        )
+        return self._decide(measured_at, twist, pose, "follow", choice.trajectory)
+
+    def _decide(
+        self,
+        measured_at: int,
+        twist: Twist,
+        pose: tuple[float, float, float],
+        status: str,
+        trajectory: npt.NDArray[np.float64] | None = None,
+    ) -> Decision:
+        if status not in ("follow", "recover"):
+            self._path = self._path[:0]
+        self.commands.give(measured_at, twist)
+        return Decision(twist, self._path, np.array([pose]) if trajectory is None else trajectory, status)

@@ -1,0 +1,95 @@
+"""Drive to the goal: plan on the map and on what is seen, choose velocities ten times a second."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import msgspec
+import numpy as np
+
+from graph.contract import Operator
+from graph.geometry import Matrix, interpolate
+from graph.messages import Drive, Goal, OccupancyGrid, Plan, PointCloud, Pose
+from operators.navigation.footprint import Footprint
+from operators.navigation.motion import Twist
+from operators.navigation.navigator import Navigator
+from operators.navigation.window import Limits
+
+HISTORY = 50  # poses kept, to find where a frame was taken
+WAITING = 10  # frames kept until the pose of their time is known
+
+
+class Planner(Operator):
+    """Plan and drive at each pose, with the latest goal, map and obstacles."""
+
+    class Config(msgspec.Struct, forbid_unknown_fields=True):
+        """What the robot is and how it shall drive."""
+
+        max_speed: float = 1.3  # m/s
+        max_reverse: float = 0.2  # m/s
+        max_turn: float = 1.0  # rad/s
+        acceleration: float = 1.0  # m/s^2
+        turn_acceleration: float = 2.5  # rad/s^2
+        length: float = 0.42  # metres, of the footprint
+        width: float = 0.31  # metres
+        padding: float = 0.04  # metres kept free around it
+        inflation: float = 0.8  # metres: the way keeps farther from things where it can
+        window: float = 4.0  # metres, side of the square in which velocities are judged
+        horizon: float = 3.0  # seconds that they are followed
+        latency: float = 0.1  # seconds from a measurement to the effect of the command that answers it
+
+    class Outputs(msgspec.Struct):
+        """What to do and what for."""
+
+        drive: Drive | None = None
+        plan: Plan | None = None
+
+    def __init__(self, config: Config | None = None) -> None:
+        super().__init__(config)
+        c: Planner.Config = self.config
+        self.navigator = Navigator(
+            Footprint(c.length, c.width),
+            Limits(c.max_speed, c.max_reverse, c.max_turn, c.acceleration, c.turn_acceleration),
+            padding=c.padding,
+            inflation=c.inflation,
+            side=c.window,
+            horizon=c.horizon,
+            latency=c.latency,
+        )
+        self._poses: deque[tuple[int, Matrix]] = deque(maxlen=HISTORY)
+        self._frames: deque[PointCloud] = deque(maxlen=WAITING)
+
+    def on_goal(self, goal: Goal) -> None:
+        self.navigator.set_goal(float(goal.target[0]), float(goal.target[1]))
+
+    def on_map(self, grid: OccupancyGrid) -> None:
+        self.navigator.set_map(grid.cells, grid.origin, grid.resolution)
+
+    def on_obstacles(self, frame: PointCloud) -> None:
+        self._frames.append(frame)
+
+    def on_pose(self, pose: Pose) -> Outputs:
+        self._poses.append((pose.measured_at, pose.world_from_base))
+        while self._frames and self._frames[0].measured_at <= pose.measured_at:
+            frame = self._frames.popleft()
+            where = self._pose_at(frame.measured_at)
+            if where is not None:
+                self.navigator.observe(frame.points, where, frame.base_from_lidar)
+        decision = self.navigator.step(pose.measured_at, pose.world_from_base, valid=pose.valid)
+        drive = Drive(measured_at=pose.measured_at, linear=decision.twist.linear, angular=decision.twist.angular)
+        plan = Plan(
+            measured_at=pose.measured_at,
+            path=decision.path,
+            trajectory=decision.trajectory,
+            status=decision.status,
+        )
+        return self.Outputs(drive=drive, plan=plan)
+
+    def _pose_at(self, time: int) -> Matrix | None:
+        """Return world_from_base at a time within the history, between its neighbours; None before its first."""
+        for (before, from_base), (after, from_next) in zip(list(self._poses)[-2::-1], list(self._poses)[::-1], strict=False):
+            if before <= time <= after:
+                share = (time - before) / max(after - before, 1)
+                return interpolate(from_base, from_next, share)
+        latest, only = self._poses[-1]
+        return np.asarray(only) if latest == time else None
