@@ -139,23 +139,23 @@ class _Review:
         missing = [port for port in ports.inputs if port not in wired and port not in optional]
         for port in missing:
             wanted = ports.inputs[port]
-            text = f"{name}.{port} is not wired; it wants {wanted.__name__}{self._offers(wanted)}"
+            text = f"{name}.{port} is not wired; it wants {wanted.__name__}{self._offers(wanted, name)}"
             self.draft.add(swap or here, text, key=True)
         if not wired and not missing:
             text = f"{name} has no inputs, so it would never run{suggestion('', ports.inputs)}"
             self.draft.add(here, text, key=True)
 
-    def _offers(self, wanted: type[msgspec.Struct]) -> str:
-        """Say which outputs of the graph have a type."""
+    def _offers(self, wanted: type[msgspec.Struct], consumer: str) -> str:
+        """Say which outputs of the other operators have a type."""
         offers = [
             f"{name}/{port}"
             for name, kind in self.kinds.items()
             for port, given in ports_of(kind).outputs.items()
-            if same_type(given, wanted)
+            if name != consumer and same_type(given, wanted)
         ]
         if same_type(Tick, wanted):
             offers.append("a timer (such as timer/10hz)")
-        return f", as given by {', '.join(offers)}" if offers else ", which no operator of this graph gives"
+        return f", as given by {', '.join(offers)}" if offers else ", which no other operator of this graph gives"
 
     def _look_at_edge(self, name: str, port: str, edge: Edge) -> None:
         own, given = self._ports(name), self._given(name, port, edge)

@@ -7,7 +7,7 @@ import inspect
 import pkgutil
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,7 @@ def load_class(run: str, root: str | Path | None = None) -> type[Operator]:
     if not colon or not name or not qualname:
         guess = ":".join(run.rsplit(".", 1)) if "." in run and not colon else "operators.planner:Planner"
         raise UserError(f"an operator is named module:Class (such as {guess}); this is '{run}'")
-    module = _load_module(name, _folders(root))
+    module = load_module(name, _folders(root))
     found: Any = module
     for part in qualname.split("."):
         if not hasattr(found, part):
@@ -71,7 +71,8 @@ def _folders(root: str | Path | None) -> list[str]:
     return folders
 
 
-def _load_module(name: str, folders: list[str]) -> Any:
+def load_module(name: str, folders: Sequence[str] = ()) -> Any:
+    """Import a module. Raises UserError in one sentence that says what is missing, or what the import raised."""
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
@@ -90,21 +91,15 @@ def _load_module(name: str, folders: list[str]) -> Any:
         raise UserError(f"{name} cannot be imported: {_one_line(error)}{_where(error)}") from error
 
 
-def _modules_near(missing: str, folders: list[str]) -> list[str]:
+def _modules_near(missing: str, folders: Sequence[str]) -> list[str]:
     """List the modules beside the one looked for, and those of its name in other packages, within some folders."""
     parent, dot, name = missing.rpartition(".")
     places = list(getattr(sys.modules.get(parent), "__path__", [])) if parent else folders
     own = [place for place in places if any(Path(place).is_relative_to(folder) for folder in folders)]
-    found = [f"{parent}{dot}{beside}" for beside in _names_in(own)]
+    found = [f"{parent}{dot}{module.name}" for module in pkgutil.iter_modules(own)]
     if parent:
-        packages = [module.name for module in pkgutil.iter_modules(folders) if module.ispkg and module.name != parent]
-        inside = {package: [str(Path(folder, package)) for folder in folders] for package in packages}
-        found += [f"{package}.{name}" for package in packages if name in _names_in(inside[package])]
+        found += [f"{file.parent.name}.{name}" for folder in folders for file in Path(folder).glob(f"*/{name}.py")]
     return found
-
-
-def _names_in(places: list[str]) -> list[str]:
-    return [module.name for module in pkgutil.iter_modules(places)]
 
 
 def _operators_in(module: Any) -> list[str]:

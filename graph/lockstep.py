@@ -126,6 +126,10 @@ class Lockstep:
             heapq.heappush(self.pending, arrival._replace(time=time + period, sequence=arrival.sequence + 1))
         return arrival
 
+    def allow(self, stamp: int) -> None:
+        """Allow arrivals through a stamp and no further, for now; replay uses it to walk through a recording."""
+        self.end = stamp
+
     def finish_at(self, stamp: int) -> None:
         """Let the run end at a stamp: by this operator's own End, or because a person stopped it."""
         self.end = min(self.end, stamp)

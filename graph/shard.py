@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import msgspec
 from mcap.writer import IndexType, Writer
@@ -25,6 +24,14 @@ LEDGER_SCHEMA = "retracer.Step"
 SUMMARY_SCHEMA = "retracer.Summary"
 
 
+Schemas = dict[str, tuple[str, str]]
+
+
+def schemas_of(types: dict[str, type[msgspec.Struct]]) -> Schemas:
+    """Describe the message types of ports for a shard: port to (name, JSON Schema)."""
+    return {port: (type_name(kind), schema(kind)) for port, kind in types.items()}
+
+
 def ledger_schema() -> bytes:
     """Return the JSON Schema of a step, as it stands in recordings."""
     return schema(Step).encode()
@@ -33,10 +40,10 @@ def ledger_schema() -> bytes:
 class Shard:
     """Writes one operator's shard.
 
-    path: the file, which must not exist. types: output port to message type.
+    path: the file, which must not exist. schemas: output port to (name, JSON Schema) of its message type.
     """
 
-    def __init__(self, path: Path, spec: NodeSpec, types: dict[str, Any], incarnation: int = 0) -> None:
+    def __init__(self, path: Path, spec: NodeSpec, schemas: Schemas, incarnation: int = 0) -> None:
         self.spec = spec
         self.stream: io.BufferedWriter = path.open("xb", buffering=1 << 20)
         self.writer = Writer(self.stream, use_chunking=False, index_types=IndexType.NONE, enable_crcs=False)
@@ -44,8 +51,8 @@ class Shard:
         mine = {"operator": spec.name, "incarnation": str(incarnation)}
         self.writer.add_metadata("retracer.shard", mine)
         self.channels: dict[str, int] = {}
-        for port, kind in types.items():
-            number = self.writer.register_schema(type_name(kind), "jsonschema", schema(kind).encode())
+        for port, (name, text) in schemas.items():
+            number = self.writer.register_schema(name, "jsonschema", text.encode())
             self.channels[port] = self.writer.register_channel(f"{spec.name}/{port}", "msgpack", number, mine)
         number = self.writer.register_schema(LEDGER_SCHEMA, "jsonschema", ledger_schema())
         self.channels[STEP] = self.writer.register_channel(f"{spec.name}/{STEP}", "msgpack", number, mine)
@@ -53,7 +60,7 @@ class Shard:
         self.channels[SUMMARY] = self.writer.register_channel(f"{spec.name}/{SUMMARY}", "msgpack", number, mine)
         self.stream.flush()
 
-    def write(self, emissions: Iterable[Emission], step: Step, summary: Summary | None = None) -> None:
+    def write(self, emissions: Iterable[Emission], step: Step, summary: Summary | dict[str, object] | None = None) -> None:
         """Append the messages of one call, then its step; flushed when this returns."""
         for emission in emissions:
             if self.spec.record[emission.port] == "full":

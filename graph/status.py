@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TextIO
 
 import numpy as np
+from rich.console import Console
+from rich.progress import Progress
 
 REFRESH = 0.25  # seconds on a terminal
 QUIET_REFRESH = 10.0  # seconds where output goes to a file
 WINDOW = 200  # calls over which the shown latency is taken
+
+
+@contextlib.contextmanager
+def progress_bar(text: str, *, quiet: bool = False) -> Iterator[Callable[[float], None]]:
+    """Show a bar on stderr for a `with` block, which is given a function to call with the share that is done."""
+    with Progress(console=Console(stderr=True), disable=quiet, transient=True) as bar:
+        task = bar.add_task(text, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
 
 
 class StatusLine:

@@ -21,7 +21,7 @@ from graph.ledger import INFINITY, Mark, Step
 from graph.lockstep import GapError, Lockstep
 from graph.node import STREAM, Emission, Node, build_operator
 from graph.realtime import Realtime
-from graph.shard import Shard
+from graph.shard import Shard, schemas_of
 from graph.threads import set_threads
 from graph.transport import Sample, Wire
 from graph.wiring import NodeSpec
@@ -70,7 +70,7 @@ class Worker:
         set_threads(self.spec.threads)
         self.node = Node(self.spec, build_operator(self.spec), boot.incarnation)
         set_threads(self.spec.threads)
-        self.shard = Shard(Path(boot.shard), self.spec, self.node.output_types, boot.incarnation)
+        self.shard = Shard(Path(boot.shard), self.spec, schemas_of(self.node.output_types), boot.incarnation)
         self.lockstep = Lockstep(self.spec) if self.spec.mode == "lockstep" and self.spec.kind != "sink" else None
         self.realtime = None if self.lockstep else Realtime(self.spec)
         self.emissions: list[Emission] = []
