@@ -1,0 +1,111 @@
+"""PointMap: ICP localization on a point map that grows with every aligned frame (paper section III-A)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from graph.geometry import inverse, rotation_angle
+from operators.pointmap.draw import generator
+from operators.pointmap.frame import Frame, prepare
+from operators.pointmap.icp import Criteria, align
+from operators.pointmap.voxel_map import MapPoints, VoxelMap
+
+Pose = npt.NDArray[np.float64]
+
+
+class Settings(NamedTuple):
+    """The parameters of PointMap; the defaults are the authors'."""
+
+    map_voxel: float = 0.03  # metres
+    frame_voxel: float = 0.10  # metres
+    vertical_resolution: float = math.radians(1.33)  # of the lidar; sets the size of the neighbourhoods
+    criteria: Criteria = Criteria()
+    least_points: int = 100  # a frame with fewer usable points is not aligned
+    largest_jump: float = 0.5  # metres between odometry's word and the alignment's
+    largest_turn: float = math.radians(15.0)
+    grow: bool = True  # whether aligned frames enter a map that has points
+    seed: int = 0
+
+
+class Track(NamedTuple):
+    """What became of one frame."""
+
+    world_from_lidar: Pose  # (4, 4)
+    valid: bool
+    reason: str  # why it is not valid
+    inliers: float  # share of the samples that found their plane in the map
+    iterations: int
+    residual: float  # metres, root mean square distance of the inliers from their planes
+    added: int  # new points of the map
+
+
+class PointMap:
+    """Localize frames on a map and add them to it.
+
+    Without an initial map the first frame enters at its guess and starts the map (PointMap*). A frame with too few
+    points, without convergence, or that ends too far from its guess is not valid: its pose is the guess, and it leaves
+    the map alone. Frames are numbered from 0; the number and the seed fix all random choices.
+    """
+
+    def __init__(self, settings: Settings | None = None, *, initial: MapPoints | None = None) -> None:
+        self.settings = Settings() if settings is None else settings
+        self.map = VoxelMap(self.settings.map_voxel)
+        self.frames = 0
+        if initial is not None:
+            self.map.insert_map(initial)
+
+    def prepare(self, points: npt.NDArray[Any]) -> Frame:
+        """Subsample a frame (n, 3) in the sensor's frame and estimate its normals."""
+        radius = 1.5 * self.settings.vertical_resolution
+        return prepare(points, voxel_size=self.settings.frame_voxel, angular_radius=radius)
+
+    def track(self, points: npt.NDArray[Any], guess: Pose) -> Track:
+        """Align a frame (n, 3) in the sensor's frame, starting at the guess world_from_lidar, and map it."""
+        return self.track_frame(self.prepare(points), guess)
+
+    def track_frame(self, frame: Frame, guess: Pose) -> Track:
+        """Do what `track` does, for a frame from `prepare`."""
+        guess = np.ascontiguousarray(guess, np.float64)
+        count = len(frame.points)
+        if count < self.settings.least_points:
+            return self._refuse(guess, f"{count} usable points, {self.settings.least_points} are needed")
+        if len(self.map) == 0:
+            return self.enter(frame, guess)
+        state = generator(self.settings.seed, self.frames)
+        result = align(self.map.store, self.map.voxel_size, frame, guess, self.settings.criteria, state)
+        jump = inverse(guess) @ result.world_from_lidar
+        distance, turn = float(np.linalg.norm(jump[:3, 3])), rotation_angle(jump)
+        reason = ""
+        if not result.converged:
+            reason = f"no convergence in {result.iterations} iterations, {100 * result.inliers:.0f} % inliers"
+        elif distance > self.settings.largest_jump or turn > self.settings.largest_turn:
+            reason = f"a jump of {distance:.2f} m and {math.degrees(turn):.1f} deg against odometry"
+        if reason:
+            return self._refuse(guess, reason, result.inliers, result.iterations, result.residual)
+        pose = result.world_from_lidar
+        added = self._add(frame, pose)
+        return Track(pose, True, "", result.inliers, result.iterations, result.residual, added)
+
+    def enter(self, frame: Frame, world_from_lidar: Pose) -> Track:
+        """Add a prepared frame to the map at a pose that is known."""
+        return Track(world_from_lidar, True, "", 1.0, 0, 0.0, self._add(frame, world_from_lidar))
+
+    def _add(self, frame: Frame, world_from_lidar: Pose) -> int:
+        """Add a frame to the map, if that shall grow; returns how many points are new."""
+        added = (
+            self.map.insert(*frame.moved(world_from_lidar), frame.scores, self.frames)
+            if self.settings.grow or not len(self.map)
+            else 0
+        )
+        self.frames += 1
+        return added
+
+    def _refuse(
+        self, guess: Pose, reason: str, inliers: float = 0.0, iterations: int = 0, residual: float = 0.0
+    ) -> Track:
+        self.frames += 1
+        return Track(guess, False, reason, inliers, iterations, residual, 0)

@@ -1,0 +1,86 @@
+"""A map of points with normals, at most one point a voxel."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from operators.pointmap.nearest import nearest_all
+from operators.pointmap.store import BLOCK_VOXELS, CELL_BLOCKS, NONE, empty_store, insert, with_room
+
+Floats = npt.NDArray[np.float32]
+Ints = npt.NDArray[np.int32]
+
+INITIAL = -1  # frame number of the points of an initial map
+
+
+class MapPoints(NamedTuple):
+    """The points of a map, as they are kept in files and handed around; all arrays have n entries."""
+
+    points: Floats  # (n, 3) metres, world
+    normals: Floats  # (n, 3) unit
+    scores: Floats  # trust in the normals
+    movable: Floats | None = None  # movable probability
+    label: npt.NDArray[np.uint8] | None = None  # 0 uncertain, 1 ground, 2 permanent, 3 longT, 4 shortT
+
+
+def cell_order(points: Floats, edge: float) -> npt.NDArray[np.int64]:
+    """Return the order that puts points (n, 3) of one cube of `edge` metres beside each other; keeps ties in order."""
+    cells = np.floor(points.astype(np.float64) / edge).astype(np.int64)
+    return np.lexsort((cells[:, 2], cells[:, 1], cells[:, 0]))
+
+
+class VoxelMap:
+    """A growing map: the first point of a voxel stays for ever, its normal is replaced by a better scored one."""
+
+    def __init__(self, voxel_size: float = 0.03) -> None:
+        if not voxel_size > 0.0:
+            raise ValueError(f"the map's voxel size must be above 0 m; it is {voxel_size}")
+        self.voxel_size = voxel_size
+        self.store = empty_store()
+
+    def __len__(self) -> int:
+        return int(self.store.counts[0])
+
+    @property
+    def points(self) -> Floats:
+        """Return the points (n, 3), metres, world; a view, older points first."""
+        return self.store.points[: len(self)]
+
+    @property
+    def normals(self) -> Floats:
+        """Return the normals (n, 3); a view."""
+        return self.store.normals[: len(self)]
+
+    @property
+    def scores(self) -> Floats:
+        """Return the scores of the normals (n,); a view."""
+        return self.store.scores[: len(self)]
+
+    @property
+    def created(self) -> Ints:
+        """Return the number (n,) of the frame that brought each point, -1 for the initial map; a view."""
+        return self.store.created[: len(self)]
+
+    def insert(self, points: Floats, normals: Floats, scores: Floats, frame: int) -> int:
+        """Add points (n, 3) in world coordinates with normals (n, 3) and scores (n,); returns how many are new."""
+        self.store = with_room(self.store, len(points))
+        return int(insert(self.store, points, normals, scores, frame, self.voxel_size))
+
+    def insert_map(self, cloud: MapPoints) -> int:
+        """Add the points of an initial map, neighbours in space as neighbours in memory; returns how many are kept."""
+        block, cell = BLOCK_VOXELS * self.voxel_size, CELL_BLOCKS * BLOCK_VOXELS * self.voxel_size
+        order = cell_order(cloud.points, block)
+        order = order[cell_order(cloud.points[order], cell)]
+        return self.insert(cloud.points[order], cloud.normals[order], cloud.scores[order], INITIAL)
+
+    def nearest(self, points: Floats, reach: float = 2.0) -> tuple[Ints, npt.NDArray[np.float64]]:
+        """Return the map point nearest each of the points (n, 3), -1 beyond `reach` metres, and its distance (n,)."""
+        found, squares = nearest_all(self.store, self.voxel_size, np.ascontiguousarray(points, np.float32), reach)
+        return found, np.where(found == NONE, np.inf, np.sqrt(squares))
+
+    def cloud(self, **more: Any) -> MapPoints:
+        """Copy the map; `more` may give `movable` and `label`."""
+        return MapPoints(self.points.copy(), self.normals.copy(), self.scores.copy(), **more)
