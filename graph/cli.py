@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import shlex
 import sys
@@ -67,8 +68,12 @@ def _check(args: argparse.Namespace) -> int:
 def _launch_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("graph", nargs="?", type=Path, default=Path("graph.yaml"))
     _changes(parser)
-    parser.add_argument("--record", type=Path, metavar="PATH", help="the recording; default: recordings/<graph>-<time>.mcap")
-    parser.add_argument("--from", dest="source", type=Path, metavar="RECORDING", help="take some operators' messages from it")
+    parser.add_argument(
+        "--record", type=Path, metavar="PATH", help="the recording; default: recordings/<graph>-<time>.mcap"
+    )
+    parser.add_argument(
+        "--from", dest="source", type=Path, metavar="RECORDING", help="take some operators' messages from it"
+    )
     parser.add_argument("--sources", metavar="A,B", help="the operators that --from stands in for")
     parser.add_argument("--in-process", action="store_true", help="one process, no Zenoh: for debuggers")
     parser.add_argument("--view", action="store_true", help="show the run live in Rerun")
@@ -114,7 +119,9 @@ def _launch(args: argparse.Namespace) -> int:
 
 def _replay_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", type=Path)
-    parser.add_argument("--operators", default="", metavar="A,B", help="which; default: all but sources, or those changed")
+    parser.add_argument(
+        "--operators", default="", metavar="A,B", help="which; default: all but sources, or those changed"
+    )
     _changes(parser)
     parser.add_argument("--record", type=Path, metavar="OUT", help="write a recording with what they say now")
     parser.add_argument("--json", action="store_true")
@@ -138,16 +145,16 @@ def _replay(args: argparse.Namespace) -> int:
     if args.swap or args.set:
         graph = override(recording.graph, args.set, args.swap)
     allow_threads(max((spec.threads for spec in recording.run.specs), default=1))
-    options = {"operators": names, "graph": graph, "changed": changed, "swapped": swapped}
+    again = functools.partial(replay, recording, operators=names, graph=graph, changed=changed, swapped=swapped)
     with progress_bar("replaying", quiet=args.json) as progress:
         if args.record is None:
-            result = replay(recording, progress=progress, **options)
+            result = again(progress=progress)
         else:
             specs = recording.run.specs if graph is None else wire(graph)
             replayed = names or [*changed, *swapped] or [spec.name for spec in specs if spec.kind == "operator"]
             run = run_for(recording, recording.run.graph if graph is None else to_dict(graph), specs)
             with Rerecorder(recording, args.record, run, replayed) as rerecorder:
-                result = replay(recording, progress=progress, keep=rerecorder.keep, **options)
+                result = again(progress=progress, keep=rerecorder.keep)
                 rerecorder.finish()
     if args.json:
         _print_json(result)
@@ -191,7 +198,9 @@ def _info(args: argparse.Namespace) -> int:
     if args.log:
         logs = {Path(item.name).stem: item.data for item in recording.attachments()}
         if args.log not in logs:
-            raise UserError(f"{args.recording} holds no log of '{args.log}'; there is {', '.join(logs) or 'none at all'}")
+            raise UserError(
+                f"{args.recording} holds no log of '{args.log}'; there is {', '.join(logs) or 'none at all'}"
+            )
         sys.stdout.write(logs[args.log].decode(errors="replace"))
         return 0
     info = describe(recording)
@@ -231,7 +240,12 @@ RUNTIME = {
         "run recorded operators again and compare to the bit",
         "retracer replay recordings/run.mcap --operators localizer",
     ),
-    "diff": (_diff_arguments, _diff, "compare two recordings in all but the wall clock", "retracer diff one.mcap two.mcap"),
+    "diff": (
+        _diff_arguments,
+        _diff,
+        "compare two recordings in all but the wall clock",
+        "retracer diff one.mcap two.mcap",
+    ),
     "info": (_info_arguments, _info, "say what is in a recording", "retracer info recordings/run.mcap --json"),
     "recover": (
         _recover_arguments,

@@ -89,12 +89,15 @@ def _check_for(hint: Any) -> Check | None:
     if not checks:
         return None
     only = checks[0]
-    if origin in (list, tuple):
-        return lambda value, lengths, where: [only(item, {}, f"{where}[]") for item in value] and None
-    if origin is dict:
-        return lambda value, lengths, where: [only(item, {}, f"{where}{{}}") for item in value.values()] and None
-    # a union: None, or the one kind of array or struct it may hold
-    return lambda value, lengths, where: only(value, lengths, where) if value is not None else None
+
+    def check_all(value: Any, lengths: dict[str, int], where: str) -> None:
+        if origin in (list, tuple, dict):
+            for item in value.values() if origin is dict else value:
+                only(item, {}, f"{where}[]")
+        elif value is not None:  # a union: None, or the one kind of array or struct it may hold
+            only(value, lengths, where)
+
+    return check_all
 
 
 def _check_struct(value: Any, lengths: dict[str, int], where: str) -> None:
@@ -103,12 +106,17 @@ def _check_struct(value: Any, lengths: dict[str, int], where: str) -> None:
         check(getattr(value, name), own, f"{where}.{name}")
 
 
-@functools.cache
-def struct_checks(kind: type[msgspec.Struct]) -> tuple[tuple[str, Check], ...]:
+_struct_checks: dict[type[Any], tuple[tuple[str, Check], ...]] = {}
+
+
+def struct_checks(kind: type[Any]) -> tuple[tuple[str, Check], ...]:
     """List (field, check) of the fields of a struct that hold arrays."""
+    if kind in _struct_checks:
+        return _struct_checks[kind]
     hints = typing.get_type_hints(kind, include_extras=True)
     found = ((name, _check_for(hints[name])) for name in kind.__struct_fields__)
-    return tuple((name, check) for name, check in found if check is not None)
+    _struct_checks[kind] = tuple((name, check) for name, check in found if check is not None)
+    return _struct_checks[kind]
 
 
 def encode(message: msgspec.Struct) -> bytes:
@@ -121,7 +129,7 @@ def encode(message: msgspec.Struct) -> bytes:
 
 
 @functools.cache
-def _decoder(kind: type[msgspec.Struct]) -> msgspec.msgpack.Decoder[Any]:
+def _decoder(kind: Any) -> msgspec.msgpack.Decoder[Any]:
     return msgspec.msgpack.Decoder(kind, ext_hook=_unpack_array)
 
 
@@ -143,9 +151,17 @@ def digest(payload: bytes) -> bytes:
     return xxhash.xxh3_128_digest(payload)
 
 
-@functools.cache
-def schema(kind: type[msgspec.Struct]) -> str:
+def schema(kind: type[Any]) -> str:
     """Return the JSON Schema of a message type as canonical text; arrays carry x-dtype, x-shape, x-unit, x-frame."""
+    if kind not in _schemas:
+        _schemas[kind] = _read_schema(kind)
+    return _schemas[kind]
+
+
+_schemas: dict[type[Any], str] = {}
+
+
+def _read_schema(kind: type[Any]) -> str:
 
     def array_schema(kind: type) -> dict[str, Any]:
         return {"description": "array"} if kind is np.ndarray else {}

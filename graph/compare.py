@@ -29,15 +29,15 @@ def differences(recorded: Any, replayed: Any, where: str = "") -> Iterator[Diffe
     """Iterate over the fields in which two values differ; equal means equal bits, so that NaN equals NaN."""
     if isinstance(recorded, msgspec.Struct) and type(recorded) is type(replayed):
         for name in recorded.__struct_fields__:
-            yield from differences(getattr(recorded, name), getattr(replayed, name), f"{where}.{name}" if where else name)
+            yield from differences(
+                getattr(recorded, name), getattr(replayed, name), f"{where}.{name}" if where else name
+            )
     elif isinstance(recorded, np.ndarray) and isinstance(replayed, np.ndarray):
         yield from _array_differences(recorded, replayed, where)
     elif isinstance(recorded, dict) and isinstance(replayed, dict) and list(recorded) == list(replayed):
         for key, value in recorded.items():
             yield from differences(value, replayed[key], f"{where}.{key}" if where else str(key))
-    elif (
-        isinstance(recorded, (list, tuple)) and isinstance(replayed, (list, tuple)) and len(recorded) == len(replayed)
-    ):
+    elif isinstance(recorded, (list, tuple)) and isinstance(replayed, (list, tuple)) and len(recorded) == len(replayed):
         for index, (old, new) in enumerate(zip(recorded, replayed, strict=True)):
             yield from differences(old, new, f"{where}[{index}]")
     elif not _same(recorded, replayed):

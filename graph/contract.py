@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 import inspect
 import types
 import typing
 from collections.abc import Iterator
-from typing import Any, ClassVar
+from typing import Any, Literal
 
 import msgspec
 
@@ -17,7 +16,7 @@ class ContractError(TypeError):
 
 
 class End(msgspec.Struct, frozen=True):
-    """Returned or yielded by an on_ method: this was the last; ends the run if the graph says `end: <this operator>`."""
+    """Returned or yielded by an on_ method: this was the last; ends the run where the graph says `end: OPERATOR`."""
 
     reason: str = ""
 
@@ -82,9 +81,17 @@ def _message_type(hint: Any, where: str) -> type[msgspec.Struct]:
     return hint
 
 
-@functools.cache
+_ports: dict[type[Operator], Ports] = {}
+
+
 def ports_of(kind: type[Operator]) -> Ports:
-    """Read the ports of an operator class from its methods and its Outputs. Raises ContractError by name."""
+    """Read the ports of an operator class from its methods and its Outputs, once. Raises ContractError by name."""
+    if kind not in _ports:
+        _ports[kind] = _read_ports(kind)
+    return _ports[kind]
+
+
+def _read_ports(kind: type[Operator]) -> Ports:
     name = kind.__qualname__
     inputs: dict[str, type[msgspec.Struct]] = {}
     for base in reversed(kind.__mro__):
@@ -92,12 +99,11 @@ def ports_of(kind: type[Operator]) -> Ports:
             port = attribute.removeprefix("on_")
             if port == attribute or port in RESERVED or not inspect.isfunction(method):
                 continue
-            method = getattr(kind, attribute)
             try:
-                hints = typing.get_type_hints(method)
+                hints = typing.get_type_hints(getattr(kind, attribute))
             except NameError as error:
                 raise ContractError(f"{name}.{attribute}: {error}") from error
-            parameters = list(inspect.signature(method).parameters)[1:]
+            parameters = list(inspect.signature(getattr(kind, attribute)).parameters)[1:]
             if len(parameters) != 1 or parameters[0] not in hints:
                 raise ContractError(f"{name}.{attribute} wants exactly one annotated parameter, the message")
             inputs[port] = _message_type(hints[parameters[0]], f"{name}.{attribute}")
@@ -105,20 +111,14 @@ def ports_of(kind: type[Operator]) -> Ports:
         hints = typing.get_type_hints(kind.Outputs)
     except NameError as error:
         raise ContractError(f"{name}.Outputs: {error}") from error
-    outputs = {field: _message_type(hints[field], f"{name}.Outputs.{field}") for field in kind.Outputs.__struct_fields__}
+    outputs = {
+        field: _message_type(hints[field], f"{name}.Outputs.{field}") for field in kind.Outputs.__struct_fields__
+    }
     return Ports(inputs, outputs)
 
 
-class Kind:
-    """Names of the three kinds of operators, for messages to people."""
-
-    SOURCE: ClassVar[str] = "source"
-    SINK: ClassVar[str] = "sink"
-    OPERATOR: ClassVar[str] = "operator"
-
-
-def kind_of(kind: type[Operator]) -> str:
+def kind_of(kind: type[Operator]) -> Literal["operator", "source", "sink"]:
     """Say whether a class is a source, a sink or a plain operator."""
     if issubclass(kind, Source):
-        return Kind.SOURCE
-    return Kind.SINK if issubclass(kind, Sink) else Kind.OPERATOR
+        return "source"
+    return "sink" if issubclass(kind, Sink) else "operator"

@@ -9,9 +9,9 @@ import msgspec
 
 from graph.codec import CodecError, decode
 from graph.compare import differences
+from graph.contract import ports_of
 from graph.errors import UserError
 from graph.loading import load_class
-from graph.contract import ports_of
 from graph.recording import Entry, Recording
 from graph.shard import STEP, SUMMARY
 
@@ -71,7 +71,8 @@ def _difference(recording: Recording, first: Entry | None, second: Entry | None)
     if first is None or second is None:
         entry = first or second
         assert entry is not None
-        return f"{entry.topic} number {entry.sequence} at {entry.stamp / 1e9:.3f} s is only in the {'first' if first else 'second'}"
+        side = "first" if first else "second"
+        return f"{entry.topic} number {entry.sequence} at {entry.stamp / 1e9:.3f} s is only in the {side}"
     where = f"{first.topic} number {first.sequence} at {first.stamp / 1e9:.3f} s"
     if first[:5] != second[:5]:
         return f"{where} meets {second.topic} number {second.sequence} at {second.stamp / 1e9:.3f} s"
@@ -94,6 +95,8 @@ def _fields(recording: Recording, first: Entry, second: Entry) -> str:
     try:
         entry = recording.graph.operators[first.operator]
         kind = ports_of(load_class(entry.run, recording.graph.root)).outputs[first.port]
-        return "; ".join(map(str, differences(decode(first.payload, kind), decode(second.payload, kind)))) or "other bytes"
+        return (
+            "; ".join(map(str, differences(decode(first.payload, kind), decode(second.payload, kind)))) or "other bytes"
+        )
     except (UserError, CodecError, KeyError):
         return "other bytes"

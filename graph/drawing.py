@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from graph.contract import Kind, Operator, kind_of, ports_of
+from graph.contract import Operator, kind_of, ports_of
 from graph.durations import duration_text
 from graph.errors import UserError
 from graph.graphfile import DEFAULT_QUEUE, TIMER, Edge, Graph
 from graph.loading import load_class
 
 _KEYWORDS = "end graph subgraph flowchart style class classDef click default direction linkStyle".split()  # noqa: SIM905
-_SHAPES = {Kind.OPERATOR: ("[", "]"), Kind.SOURCE: ("[/", "/]"), Kind.SINK: ("([", "])")}
+_SHAPES = {"operator": ("[", "]"), "source": ("[/", "/]"), "sink": ("([", "])")}
 
 
 def mermaid(graph: Graph) -> str:
@@ -25,7 +25,7 @@ def mermaid(graph: Graph) -> str:
             continue
     lines = ["flowchart LR"]
     for name, entry in graph.operators.items():
-        opening, closing = _SHAPES[kind_of(kinds[name]) if name in kinds else Kind.OPERATOR]
+        opening, closing = _SHAPES[kind_of(kinds[name]) if name in kinds else "operator"]
         lines.append(f'    {_node(name)}{opening}"{name}<br/>{entry.run}"{closing}')
     edges = [(name, port, edge) for name, entry in graph.operators.items() for port, edge in entry.inputs.items()]
     for timer in dict.fromkeys(edge.port for _, _, edge in edges if edge.operator == TIMER):

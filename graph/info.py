@@ -88,7 +88,9 @@ def describe(recording: Recording) -> Info:
         rate = (len(times) - 1) / span if span > 0 else 0.0
         gap = float(np.diff(times).max()) if len(times) > 1 else 0.0
         topics.append(
-            TopicInfo(topic, kind, len(times), recorded.get(topic, 0), round(rate, 3), sizes.get(topic, 0), round(gap, 6))
+            TopicInfo(
+                topic, kind, len(times), recorded.get(topic, 0), round(rate, 3), sizes.get(topic, 0), round(gap, 6)
+            )
         )
     operators = [
         OperatorInfo(

@@ -101,8 +101,8 @@ def launch_in_process(
 ) -> tuple[Verdict, Path]:
     """Run a checked lockstep graph in this process; returns the verdict and the path of the recording.
 
-    shuffle: a seed that draws which operator goes next, for tests; None goes round. An operator's exception passes through,
-    for the debugger. Raises UserError for a realtime graph, which needs processes.
+    shuffle: a seed that draws which operator goes next, for tests; None goes round. An operator's exception passes
+    through, for the debugger. Raises UserError for a realtime graph, which needs processes.
     """
     if graph.clock.mode != "lockstep":
         raise UserError("--in-process runs lockstep graphs; this one says clock.mode: realtime")

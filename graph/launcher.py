@@ -11,17 +11,16 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import IO, Any
 
 import msgspec
 
-from graph.errors import UserError
 from graph.graphfile import Graph
 from graph.merge import merge
-from graph.recording import Run, Verdict
+from graph.recording import Verdict
 from graph.run import Paths, describe
 from graph.status import StatusLine
 from graph.threads import environment
@@ -163,8 +162,17 @@ class Launcher:
                 continue
             child.close()
             spec = child.spec
-            how = f"was ended by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"failed (exit code {code})"
-            if self.realtime and spec.restart == "on-failure" and name in {ready for ready, _ in self.ready} and not self.stopping:
+            how = (
+                f"was ended by signal {-code} ({signal.Signals(-code).name})"
+                if code < 0
+                else f"failed (exit code {code})"
+            )
+            if (
+                self.realtime
+                and spec.restart == "on-failure"
+                and name in {ready for ready, _ in self.ready}
+                and not self.stopping
+            ):
                 self.status.say(f"{name} {how}; starting it again")
                 self.spawn(spec, child.incarnation + 1)
                 continue
@@ -255,7 +263,9 @@ class Launcher:
             self.tell(Control("finish"))
         else:
             self.tell(Control("pause"))
-            self._await(lambda: all(self._phase(name) in ("paused", "finished") for name in self._working()), deadline, before)
+            self._await(
+                lambda: all(self._phase(name) in ("paused", "finished") for name in self._working()), deadline, before
+            )
             end = max((state.stamp for name, state in self.states.items() if name in self._working()), default=0)
             self.tell(Control("end", max(end, 0)))
         self._await(self._finished, deadline + (LEAVE if self.realtime else 0), before)
@@ -327,6 +337,3 @@ class Failure(Exception):
 def launch(graph: Graph, **options: Any) -> Outcome:
     """Run a checked graph in processes of its own. See Launcher for the options."""
     return Launcher(graph, **options).launch()
-
-
-__all__: Sequence[str] = ["Launcher", "Outcome", "Run", "UserError", "launch"]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from graph.ledger import INFINITY, Mark, Skip
 from graph.wiring import Input, NodeSpec
@@ -60,7 +60,9 @@ class Lockstep:
     def __init__(self, spec: NodeSpec) -> None:
         self.spec = spec
         self.edges = [_Edge(edge, port) for port, edge in enumerate(spec.inputs) if edge.period is None]
-        self.timers = [(port, edge.period, edge.delay) for port, edge in enumerate(spec.inputs) if edge.period is not None]
+        self.timers = [
+            (port, edge.period, edge.delay) for port, edge in enumerate(spec.inputs) if edge.period is not None
+        ]
         self.pending: list[Arrival] = [Arrival(delay, port, 0, 0, None) for port, _, delay in self.timers]
         heapq.heapify(self.pending)
         self.periods = {port: period for port, period, _ in self.timers}
@@ -80,9 +82,7 @@ class Lockstep:
             if sequence != edge.received:
                 raise GapError(f"{self.spec.name}: {topic} number {edge.received} is missing; number {sequence} came")
             edge.received += 1
-            heapq.heappush(
-                self.pending, Arrival(stamp + edge.edge.delay, edge.port, sequence, incarnation, payload)
-            )
+            heapq.heappush(self.pending, Arrival(stamp + edge.edge.delay, edge.port, sequence, incarnation, payload))
             edge.settle()
 
     def mark(self, operator: str, mark: Mark) -> None:

@@ -156,7 +156,7 @@ def merge(
                 writer.add_attachment(0, 0, f"log/{log.stem}.txt", "text/plain", text)
         verdict = Verdict("INCOMPLETE" if why else "COMPLETE", why, end, wall_seconds, accounts, count)
         writer.add_metadata(VERDICT, seal(verdict))
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
     part.replace(out)
     return verdict
 

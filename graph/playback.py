@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import copy
-import functools
 import importlib
 from collections.abc import Iterator, Sequence
 from itertools import groupby
@@ -52,10 +51,16 @@ class Playback(Source):
                 yield stamp, said
 
 
-@functools.cache
+_classes: dict[type[Operator], type[Playback]] = {}
+
+
 def playback_of(kind: type[Operator]) -> type[Playback]:
-    """Make the class that plays back an operator class."""
-    return type(f"PlaybackOf{kind.__name__}", (Playback,), {"Outputs": kind.Outputs, "__module__": __name__})
+    """Return the class that plays back an operator class; the same one each time."""
+    if kind not in _classes:
+        _classes[kind] = type(
+            f"PlaybackOf{kind.__name__}", (Playback,), {"Outputs": kind.Outputs, "__module__": __name__}
+        )
+    return _classes[kind]
 
 
 class _Place:

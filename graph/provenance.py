@@ -7,9 +7,19 @@ import platform
 from importlib import metadata
 from pathlib import Path
 
-PACKAGES = (
-    "retracer", "eclipse-zenoh", "embreex", "llvmlite", "mcap", "msgspec", "numba", "numpy", "pybullet", "scipy", "torch",
-)  # fmt: skip
+PACKAGES = [
+    "retracer",
+    "eclipse-zenoh",
+    "embreex",
+    "llvmlite",
+    "mcap",
+    "msgspec",
+    "numba",
+    "numpy",
+    "pybullet",
+    "scipy",
+    "torch",
+]
 
 FEATURES = ("avx", "avx2", "fma", "avx512f", "avx512_bf16", "amx_bf16", "neon", "asimd", "sve")
 
@@ -26,7 +36,7 @@ def versions() -> dict[str, str]:
 
 
 def cpu_class() -> str:
-    """Return the class of the processor: vendor, family, model and the instruction sets that change how sums are made."""
+    """Return the class of the processor: vendor, family, model and the instruction sets that change a sum."""
     try:
         text = Path("/proc/cpuinfo").read_text().split("\n\n")[0]
     except OSError:

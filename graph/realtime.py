@@ -18,9 +18,7 @@ class Realtime:
     def __init__(self, spec: NodeSpec) -> None:
         self.spec = spec
         self.queues: list[deque[Arrival]] = [deque() for _ in spec.inputs]
-        self.limits = [
-            1 if edge.queue == "latest" or spec.kind == "sink" else int(edge.queue) for edge in spec.inputs
-        ]
+        self.limits = [1 if edge.queue == "latest" or spec.kind == "sink" else int(edge.queue) for edge in spec.inputs]
         self.ticks = [0] * len(spec.inputs)  # number of the next tick
         self.skips: list[Skip] = []
         self.received: dict[str, int] = {edge.topic: 0 for edge in spec.inputs if edge.period is None}
@@ -53,7 +51,12 @@ class Realtime:
         for tick in self._due(now):
             if best is None or tick < best:
                 best = tick
-        if not self.stopped and self.stream is not None and self.stream <= now and (best is None or self.stream < best.time):
+        if (
+            not self.stopped
+            and self.stream is not None
+            and self.stream <= now
+            and (best is None or self.stream < best.time)
+        ):
             best = Arrival(self.stream, -1, 0, 0, None)
         if best is None:
             return None
@@ -89,7 +92,9 @@ class Realtime:
         """Return when the next tick or item is due; INFINITY if never."""
         if self.stopped:
             return INFINITY
-        times = [self.ticks[port] * edge.period for port, edge in enumerate(self.spec.inputs) if edge.period is not None]
+        times = [
+            self.ticks[port] * edge.period for port, edge in enumerate(self.spec.inputs) if edge.period is not None
+        ]
         if self.spec.duration is not None:
             times = [time for time in times if time <= self.spec.duration]
         return min([*times, INFINITY if self.stream is None else self.stream])

@@ -1,4 +1,4 @@
-"""Recordings: MCAP files with the exact bytes of every message, the ledger of every operator, and the resolved graph."""
+"""Recordings: MCAP files with the exact bytes of every message, the ledger of every operator, and the graph."""
 
 from __future__ import annotations
 
@@ -12,14 +12,25 @@ from typing import IO, Any, NamedTuple
 
 import msgspec
 from mcap.exceptions import EndOfFile
-from mcap.records import Attachment, Channel, Footer, Header, McapRecord, Message, Metadata, Schema
+from mcap.records import (
+    Attachment,
+    Channel,
+    Footer,
+    Header,
+    McapRecord,
+    Message,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
 from mcap.stream_reader import StreamReader
 
 from graph.codec import digest
 from graph.errors import UserError
 from graph.graphfile import Graph, from_dict
 from graph.ledger import Step
-from graph.shard import LEDGER_SCHEMA, STEP, SUMMARY, SUMMARY_SCHEMA, ledger_schema
+from graph.shard import LEDGER_SCHEMA, STEP, SUMMARY, ledger_schema
 from graph.wiring import NodeSpec
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -103,7 +114,7 @@ class _Exact:
 
 
 def read_records(stream: IO[bytes], *, chunks: bool = False) -> Iterator[McapRecord]:
-    """Iterate over the records of an MCAP stream, checking chunk CRCs. Raises whatever is wrong with it at that place."""
+    """Iterate over the records of an MCAP stream, checking chunk CRCs. Raises what is wrong where it is wrong."""
     reader = StreamReader(_Exact(stream), emit_chunks=chunks, record_size_limit=2 << 30)  # type: ignore[arg-type]
     reader._validate_crcs = True  # of chunks; the running CRC of the whole data section would cost as much again
     reader._skip_magic = True
@@ -209,7 +220,9 @@ class Recording:
         summary = stream.read(size - start - _FOOTER_BYTES)
         if zlib.crc32(summary + tail[: 9 + 16]) != crc:
             raise _complaint(self.path, ValueError("the checksum of its index does not fit"))
-        channels, places, counts = Channels(), [], {}
+        channels = Channels()
+        places: list[int] = []
+        counts: dict[str, int] = {}
         topics: dict[int, str] = {}
         try:
             reader = StreamReader(io.BytesIO(summary + tail), skip_magic=True)
@@ -219,9 +232,9 @@ class Recording:
                 channels.take(record)
                 if isinstance(record, Channel):
                     topics[record.id] = record.topic
-                if type(record).__name__ == "MetadataIndex":
+                if isinstance(record, MetadataIndex):
                     places.append(record.offset)
-                if type(record).__name__ == "Statistics":
+                if isinstance(record, Statistics):
                     for channel, count in record.channel_message_counts.items():
                         if channel in topics:
                             counts[topics[channel]] = counts.get(topics[channel], 0) + count
@@ -229,7 +242,8 @@ class Recording:
             for place in places:
                 stream.seek(place)
                 record = next(iter(StreamReader(_Exact(stream), skip_magic=True).records))  # type: ignore[arg-type]
-                metadata[record.name] = record.metadata
+                if isinstance(record, Metadata):
+                    metadata[record.name] = record.metadata
         except RecordingError:
             raise
         except Exception as error:
@@ -294,6 +308,3 @@ class Recording:
         for topic, (name, text) in self.types.items():
             if topic.endswith(f"/{STEP}") and (name != LEDGER_SCHEMA or text.encode() != ledger_schema()):
                 raise RecordingError(f"{self.path}: its ledger is of another version of retracer")
-
-
-__all__ = ["SUMMARY_SCHEMA", "Entry", "Metadata", "Recording", "RecordingError", "Run", "Verdict", "read_records"]

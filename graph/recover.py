@@ -1,4 +1,4 @@
-"""What a crash left: a folder of shards, a shard, or a recording that is cut or damaged; every whole chunk comes back."""
+"""What a crash left: a folder of shards, or a recording that is cut or damaged; every whole chunk comes back."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class _Scan:
         self.lost.append("the file ends without an index")
 
     def _read_index(self) -> None:
-        """Take schemas and channels from the index at the end, where it is left: those in a lost chunk would be missing."""
+        """Take schemas and channels from the index at the end, if it is left: a lost chunk may have held them."""
         for _, opcode, content in self.records():
             try:
                 if opcode == Opcode.SCHEMA:
@@ -133,7 +133,7 @@ class _Scan:
                         writer.start(profile="retracer-shard", library="retracer")
                     self._copy(operator, port, incarnation, message)
         for writer in self.writers.values():
-            writer.finish()
+            writer.finish()  # type: ignore[no-untyped-call]
         for stream in streams:
             stream.close()
         return paths
@@ -145,9 +145,7 @@ class _Scan:
             schema = writer.register_schema(name, "jsonschema", text.encode())
             mine = {"operator": operator, "incarnation": str(incarnation)}
             self.ids[key] = writer.register_channel(f"{operator}/{port}", "msgpack", schema, mine)
-        writer.add_message(
-            self.ids[key], message.log_time, message.data, message.publish_time, message.sequence
-        )
+        writer.add_message(self.ids[key], message.log_time, message.data, message.publish_time, message.sequence)
 
     def _metadata(self, place: int, content: memoryview) -> None:
         try:

@@ -1,4 +1,4 @@
-"""Replay: feed operators exactly what their ledger says they consumed, and hold what they say against what they said."""
+"""Replay: feed operators what their ledger says they consumed, and compare what they say with what they said."""
 
 from __future__ import annotations
 
@@ -101,9 +101,9 @@ def replay(
 ) -> Replay:
     """Run operators again and compare.
 
-    operators: which; by default every one but sources and sinks, or those that were changed or swapped. graph: the recorded
-    graph with changes applied. changed: operators with other settings, fed by their ledger. swapped: operators with another class,
-    fed by rule 2. keep: called with (operator, incarnation, emissions, step, summary) of each call.
+    operators: which; by default every one but sources and sinks, or those that were changed or swapped. graph: the
+    recorded graph with changes applied. changed: operators with other settings, fed by their ledger. swapped: operators
+    with another class, fed by rule 2. keep: called with (operator, incarnation, emissions, step, summary) of each call.
     Raises UserError for unknown names and for schemas that cannot be read.
     """
     recording.require_ledger()
@@ -120,7 +120,9 @@ def replay(
     run = _Run(recording, specs, [name for name in dict.fromkeys([*names, *helpers]) if name not in swapped], keep)
     others = [Swapped(recording, specs[name], run.payload, keep) for name in swapped]
     run.go(others, progress)
-    reports = [run.retraced[name].report for name in run.retraced] + [_swap_report(other, recording) for other in others]
+    reports = [run.retraced[name].report for name in run.retraced] + [
+        _swap_report(other, recording) for other in others
+    ]
     seconds = recording.verdict.end / 1e9
     for report in reports:
         report.times_real_time = round(seconds / report.seconds, 2) if report.seconds > 0 else 0.0
@@ -164,7 +166,9 @@ def _producers_of_digests(recording: Recording, specs: dict[str, NodeSpec], name
             if producer is None or producer.record.get(port) != "digest":
                 continue
             if producer.kind == "source":
-                raise UserError(f"{edge.topic} comes from a source and was recorded as digests only: {spec.name} cannot be fed")
+                raise UserError(
+                    f"{edge.topic} comes from a source and was recorded as digests only: {spec.name} cannot be fed"
+                )
             if edge.producer not in names:
                 found.append(edge.producer)
                 todo.append(edge.producer)
@@ -253,8 +257,8 @@ class _Run:
                     self._step(item, incarnation, step, said, summaries)
                     busy = True
         for item in self.retraced.values():
-            for incarnation, step in item.waiting:
-                missing = next(ref for ref in step.consumed if self._missing(ref))
+            for _, step in item.waiting:
+                missing: Ref = next(ref for ref in step.consumed if self._missing(ref))
                 item.report.unjudged += 1
                 item.broken = True
                 what = f"{missing.topic} number {missing.sequence}, which it consumed, is not in the recording"
@@ -291,7 +295,7 @@ class _Run:
             report.first = report.first or Divergence(step.index, step.stamp, step.port, what, [])
             return
         report.seconds += time.perf_counter() - begin
-        for ref in (*step.consumed, *step.skipped):
+        for ref in (*step.consumed, *(Ref(*msgspec.structs.astuple(skip)[:3]) for skip in step.skipped)):
             self._release((ref.topic, ref.incarnation, ref.sequence))
         divergence = self._judge(item, incarnation, step, done, emissions, said)
         if divergence is None and step.port == END:
@@ -327,7 +331,8 @@ class _Run:
         """Compare one replayed call with the recorded one."""
         for was, now, emission in itertools.zip_longest(step.emitted, done.emitted, emissions):
             if was is None or now is None:
-                extra = was or now
+                extra = was if now is None else now
+                assert extra is not None
                 what = f"number {extra.sequence} {'was said and is not' if now is None else 'was not said before'}"
                 return Divergence(step.index, step.stamp, f"{item.spec.name}/{extra.port}", what, [])
             if was == now:

@@ -37,7 +37,9 @@ class Rerecorder:
         self.paths.shards.mkdir(parents=True)
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         for shard in self.shards.values():
             shard.close()
         self.shards.clear()
@@ -87,7 +89,9 @@ class Rerecorder:
             paths.append(self.paths.shards / f"{name}.{incarnation}.mcap")
         self.shards.clear()
         reasons = [f"{', '.join(sorted(self.replayed))} replayed on {self.recording.path.name}: not one run"]
-        return merge(paths, self.paths.recording, self.run, reasons=reasons, wall_seconds=self.recording.verdict.wall_seconds)
+        return merge(
+            paths, self.paths.recording, self.run, reasons=reasons, wall_seconds=self.recording.verdict.wall_seconds
+        )
 
 
 def run_for(recording: Recording, graph: dict[str, Any], specs: Iterable[NodeSpec]) -> Run:

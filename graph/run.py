@@ -49,7 +49,7 @@ class Paths(NamedTuple):
 
 
 def describe(graph: Graph, specs: list[NodeSpec], command: str = "") -> Run:
-    """Write down where a run comes from: the graph, versions, processor, and the digest of every file a config names."""
+    """Write down where a run comes from: graph, versions, processor, and the digest of every file a config names."""
     files = {}
     for spec in specs:
         config = build_config(load_class(spec.run, spec.root), spec.config, Path(spec.root))

@@ -5,9 +5,9 @@ Unchunked MCAP, flushed after each call, so that a killed process loses at most 
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterable
 from pathlib import Path
+from typing import IO
 
 import msgspec
 from mcap.writer import IndexType, Writer
@@ -45,7 +45,7 @@ class Shard:
 
     def __init__(self, path: Path, spec: NodeSpec, schemas: Schemas, incarnation: int = 0) -> None:
         self.spec = spec
-        self.stream: io.BufferedWriter = path.open("xb", buffering=1 << 20)
+        self.stream: IO[bytes] = path.open("xb", buffering=1 << 20)
         self.writer = Writer(self.stream, use_chunking=False, index_types=IndexType.NONE, enable_crcs=False)
         self.writer.start(profile="retracer-shard", library="retracer")
         mine = {"operator": spec.name, "incarnation": str(incarnation)}
@@ -60,7 +60,9 @@ class Shard:
         self.channels[SUMMARY] = self.writer.register_channel(f"{spec.name}/{SUMMARY}", "msgpack", number, mine)
         self.stream.flush()
 
-    def write(self, emissions: Iterable[Emission], step: Step, summary: Summary | dict[str, object] | None = None) -> None:
+    def write(
+        self, emissions: Iterable[Emission], step: Step, summary: Summary | dict[str, object] | None = None
+    ) -> None:
         """Append the messages of one call, then its step; flushed when this returns."""
         for emission in emissions:
             if self.spec.record[emission.port] == "full":
@@ -81,5 +83,5 @@ class Shard:
 
     def close(self) -> None:
         """Write the footer."""
-        self.writer.finish()
+        self.writer.finish()  # type: ignore[no-untyped-call]
         self.stream.close()

@@ -105,8 +105,12 @@ class StatusLine:
         return {
             name: {
                 "steps": self.steps[name],
-                "p50_ms": round(float(np.percentile(self.durations[name], 50)) / 1e6, 3) if self.durations[name] else 0.0,
-                "p95_ms": round(float(np.percentile(self.durations[name], 95)) / 1e6, 3) if self.durations[name] else 0.0,
+                "p50_ms": round(float(np.percentile(self.durations[name], 50)) / 1e6, 3)
+                if self.durations[name]
+                else 0.0,
+                "p95_ms": round(float(np.percentile(self.durations[name], 95)) / 1e6, 3)
+                if self.durations[name]
+                else 0.0,
                 "skipped": self.skipped[name],
             }
             for name in self.names

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 import traceback
 from collections.abc import Callable, Sequence
@@ -66,7 +67,9 @@ class Swapped:
                 topic = f"{operator}/{item.port}"
                 if topic not in self.counts:
                     continue
-                payload = said.get((topic, incarnation, item.sequence)) or self.remade(topic, incarnation, item.sequence)
+                payload = said.get((topic, incarnation, item.sequence)) or self.remade(
+                    topic, incarnation, item.sequence
+                )
                 if payload is not None:
                     self.schedule.deliver(topic, incarnation, self.counts[topic], stamp, payload)
                     self.counts[topic] += 1
@@ -81,7 +84,7 @@ class Swapped:
             self.schedule.started = self.started = True
             self._call(lambda: self.node.start(self._emit))
         while not self.error and (arrival := self.schedule.next()) is not None:
-            self._call(lambda arrival=arrival: self.node.handle(arrival, arrival.time, self._emit))
+            self._call(functools.partial(self.node.handle, arrival, arrival.time, self._emit))
 
     def _emit(self, emission: Emission) -> None:
         self.messages += 1
@@ -120,7 +123,7 @@ class Swapped:
                 self._field(f"{port}.{name}", getattr(old, name), getattr(new, name))
 
     def _field(self, name: str, old: Any, new: Any) -> None:
-        """Note the largest difference of one field in one pair of messages; NaN where it has another shape or is no number."""
+        """Note the largest difference of one field in one pair of messages; NaN where there is none to speak of."""
         try:
             a, b = np.asarray(old, np.float64), np.asarray(new, np.float64)
             gap = float(np.abs(a - b).max(initial=0.0)) if a.shape == b.shape else float("nan")
@@ -137,7 +140,7 @@ class Swapped:
             self._call(lambda: self.node.finish(self.recording.verdict.end, self._emit))
 
     def comparison(self) -> dict[str, dict[str, Any]]:
-        """Return, for each output and field: messages compared, median and largest difference, messages without a partner."""
+        """Return, for each output and field: messages compared, median and largest difference, and those alone."""
         report: dict[str, dict[str, Any]] = {}
         for port, pairs in self.pairs.items():
             report[port] = {

@@ -70,12 +70,14 @@ class Wire:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()
 
     def close(self) -> None:
         """Close the session; without it Zenoh's threads keep the process alive."""
-        self.session.close()
+        self.session.close()  # type: ignore[no-untyped-call]
 
     def _receive(self, sample: zenoh.Sample) -> None:
         attachment = sample.attachment

@@ -1,4 +1,4 @@
-"""The process of one operator: `python -m graph.worker`, started by the launcher, told what to be by one line on stdin."""
+"""The process of one operator: `python -m graph.worker`, told by one line on stdin what to be."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class State(msgspec.Struct):
 
 
 class Worker:
-    """Owns the wire, the schedule, the node and the shard, and moves bytes between them. One thread but for a source's."""
+    """Owns the wire, the schedule, the node and the shard, and moves bytes between them, in one thread."""
 
     def __init__(self, boot: Boot, wire: Wire) -> None:
         self.boot, self.wire, self.spec = boot, wire, boot.spec
@@ -112,7 +112,7 @@ class Worker:
     # what comes in
 
     def _pull(self) -> None:
-        """Fetch the next item of the stream whenever there is demand; runs in its own thread, for drivers that block."""
+        """Fetch the next item of the stream whenever there is demand; in its own thread, for drivers that block."""
         try:
             while True:
                 self.demand.acquire()
@@ -125,7 +125,7 @@ class Worker:
             self.wire.inbox.put(Sample("failed", b"", (0, 0, 0)))
 
     def drain(self, timeout: float | None) -> bool:
-        """Take in what has come, waiting up to `timeout` seconds for the first (0: not at all). Say if anything came."""
+        """Take in what has come, waiting at most `timeout` seconds for the first. Say whether anything came."""
         inbox = self.wire.inbox
         if timeout and inbox.empty():
             try:
@@ -294,7 +294,9 @@ class Worker:
         """Wait until a stamp is due, where the clock says `pace: realtime` and the stamp is born here."""
         if self.spec.pace == "realtime" and not self.spec.producers:
             assert self.origin is not None
-            while (ahead := self.origin + stamp - time.monotonic_ns()) > 0 and not self.leaving and self.phase != "paused":
+            while (
+                (ahead := self.origin + stamp - time.monotonic_ns()) > 0 and not self.leaving and self.phase != "paused"
+            ):
                 self.drain(ahead / 1e9)
 
     def run_realtime(self, schedule: Realtime) -> None:
@@ -334,7 +336,7 @@ def _outlive_nobody() -> None:
     """End this process when the launcher is gone, even if that was killed: its end of our stdin closes."""
 
     def watch() -> None:
-        while sys.stdin.buffer.raw.read(1):  # type: ignore[attr-defined]
+        while os.read(0, 1):
             pass
         os._exit(3)
 

@@ -44,6 +44,14 @@ class _Dumper(yaml.SafeDumper):
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
+    def represent_str(self, data: str) -> yaml.ScalarNode:
+        """Escape the line breaks that only YAML 1.1 knows: in any other style PyYAML folds them into spaces."""
+        rare = any(character in data for character in "\x85\u2028\u2029")
+        return self.represent_scalar(f"{_TAG}str", data, style='"' if rare else None)
+
+
+_Dumper.add_representer(str, _Dumper.represent_str)
+
 
 class Place(NamedTuple):
     """Where something stands in a file; counted from 1, as editors do."""
