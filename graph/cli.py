@@ -131,7 +131,8 @@ def _replay(args: argparse.Namespace) -> int:
     from graph.graphfile import to_dict
     from graph.override import override
     from graph.recording import Recording
-    from graph.replay import lines, replay
+    from graph.replay import replay
+    from graph.replay_report import lines
     from graph.rerecord import Rerecorder, run_for
     from graph.status import progress_bar
     from graph.threads import allow_threads
