@@ -263,7 +263,8 @@ class Worker:
             arrival = schedule.next() if self.phase == "running" else None
             if arrival is not None:
                 starved = 0.0
-                self.pace(arrival.time)
+                if arrival.payload is None:
+                    self.pace(arrival.time)
                 if self.leaving:
                     return
                 step = node.handle(arrival, arrival.time, self.emit)
@@ -291,8 +292,8 @@ class Worker:
         self.after(step)
 
     def pace(self, stamp: int) -> None:
-        """Wait until a stamp is due, where the clock says `pace: realtime` and the stamp is born here."""
-        if self.spec.pace == "realtime" and not self.spec.producers:
+        """Wait until a stamp that is born here, a tick's or a source's, is due, where the clock says `pace: realtime`."""
+        if self.spec.pace == "realtime":
             assert self.origin is not None
             while (
                 (ahead := self.origin + stamp - time.monotonic_ns()) > 0 and not self.leaving and self.phase != "paused"
