@@ -26,10 +26,16 @@ class Fault(NamedTuple):
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known name that was probably meant, if one is near enough."""
-    lowered = {name.lower(): name for name in known}
-    close = difflib.get_close_matches(word.lower(), lowered, n=1, cutoff=0.6)
-    return lowered[close[0]] if close else None
+    """Return the known name that was probably meant, if one is near enough; of dotted names the last part counts."""
+
+    def last(name: str) -> str:
+        return name.rpartition(".")[2].lower()
+
+    candidates: dict[str, str] = {}
+    for name in known:
+        candidates.setdefault(last(name), name)
+    close = difflib.get_close_matches(last(word), candidates, n=1, cutoff=0.6)
+    return candidates[close[0]] if close else None
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:

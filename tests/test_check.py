@@ -258,6 +258,17 @@ def test_classes_are_found_beside_the_graph_and_within_classes(tmp_path: Path) -
         load_class("beside_:Robots", tmp_path)
 
 
+def test_a_shared_package_makes_no_likeness() -> None:
+    with pytest.raises(UserError, match=r"there is no module 'tests\.nothing_like_it'; there are tests\."):
+        load_class("tests.nothing_like_it:Robot")
+
+
+def test_the_robot_of_this_repository_has_no_mistakes() -> None:
+    pytest.importorskip("operators.simulator", reason="its world wants the extra 'sim'")
+    report = check(ROOT / "graph.yaml")
+    assert [str(mistake) for mistake in (*report.mistakes, *report.warnings)] == []
+
+
 @pytest.mark.parametrize("run", ["", "tests.sample_operators", ":Counter", "tests.sample_operators:"])
 def test_what_is_no_class_name_is_refused(run: str) -> None:
     with pytest.raises(UserError, match="an operator is named module:Class"):
