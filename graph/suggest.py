@@ -26,16 +26,15 @@ class Fault(NamedTuple):
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known name that was probably meant, if one is near enough; of dotted names the last part counts."""
+    """Return the known name that was probably meant, if one is near enough; a package that both share counts not."""
 
-    def last(name: str) -> str:
-        return name.rpartition(".")[2].lower()
+    def likeness(name: str) -> float:
+        (parent, _, own), (other, _, last) = word.lower().rpartition("."), name.lower().rpartition(".")
+        pair = (own, last) if parent == other else (word.lower(), name.lower())
+        return difflib.SequenceMatcher(None, *pair).ratio()
 
-    candidates: dict[str, str] = {}
-    for name in known:
-        candidates.setdefault(last(name), name)
-    close = difflib.get_close_matches(last(word), candidates, n=1, cutoff=0.6)
-    return candidates[close[0]] if close else None
+    best = max(known, key=likeness, default=None)
+    return best if best is not None and likeness(best) >= 0.6 else None
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:
