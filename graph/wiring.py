@@ -7,10 +7,8 @@ from typing import Any, Literal
 import msgspec
 
 from graph.contract import kind_of, ports_of
-from graph.graphfile import Graph
+from graph.graphfile import TIMER, Graph
 from graph.loading import load_class
-
-TIMER = "timer"
 
 
 class Input(msgspec.Struct, frozen=True):
