@@ -54,16 +54,23 @@ def describe(graph: Graph, specs: list[NodeSpec], command: str = "") -> Run:
     for spec in specs:
         config = build_config(load_class(spec.run, spec.root), spec.config, Path(spec.root))
         for path in config_files(config):
-            files[str(path)] = file_digest(path)
+            files[_near(path)] = file_digest(path)
+    root = _near(Path(graph.root))
     return Run(
-        graph=to_dict(graph),
-        specs=tuple(specs),
+        graph=to_dict(msgspec.structs.replace(graph, root=root)),
+        specs=tuple(msgspec.structs.replace(spec, root=root) for spec in specs),
         versions=versions(),
         cpu=cpu_class(),
         files=files,
         started=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         command=command,
     )
+
+
+def _near(path: Path) -> str:
+    """Name a path from the working directory if it lies there, so that a replay works in another checkout."""
+    here = Path.cwd()
+    return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
 
 
 def run_of(shards: Path) -> Run:

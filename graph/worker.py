@@ -292,7 +292,7 @@ class Worker:
         self.after(step)
 
     def pace(self, stamp: int) -> None:
-        """Wait until a stamp that is born here, a tick's or a source's, is due, where the clock says `pace: realtime`."""
+        """Wait until a stamp that is born here, a tick's or a source's, is due, where the clock says pace: realtime."""
         if self.spec.pace == "realtime":
             assert self.origin is not None
             while (
