@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections import deque
 
 import msgspec
-import numpy as np
 
 from graph.contract import Operator
 from graph.geometry import Matrix, interpolate
 from graph.messages import Drive, Goal, OccupancyGrid, Plan, PointCloud, Pose
 from operators.navigation.footprint import Footprint
-from operators.navigation.motion import Twist
 from operators.navigation.navigator import Navigator
 from operators.navigation.window import Limits
 
@@ -32,7 +30,7 @@ class Planner(Operator):
         turn_acceleration: float = 2.5  # rad/s^2
         length: float = 0.42  # metres, of the footprint
         width: float = 0.31  # metres
-        padding: float = 0.04  # metres kept free around it
+        padding: float = 0.05  # metres kept free around it
         inflation: float = 0.8  # metres: the way keeps farther from things where it can
         window: float = 4.0  # metres, side of the square in which velocities are judged
         horizon: float = 3.0  # seconds that they are followed
@@ -68,7 +66,7 @@ class Planner(Operator):
     def on_obstacles(self, frame: PointCloud) -> None:
         self._frames.append(frame)
 
-    def on_pose(self, pose: Pose) -> Outputs:
+    def on_pose(self, pose: Pose) -> Planner.Outputs:
         self._poses.append((pose.measured_at, pose.world_from_base))
         while self._frames and self._frames[0].measured_at <= pose.measured_at:
             frame = self._frames.popleft()
@@ -87,9 +85,13 @@ class Planner(Operator):
 
     def _pose_at(self, time: int) -> Matrix | None:
         """Return world_from_base at a time within the history, between its neighbours; None before its first."""
-        for (before, from_base), (after, from_next) in zip(list(self._poses)[-2::-1], list(self._poses)[::-1], strict=False):
-            if before <= time <= after:
-                share = (time - before) / max(after - before, 1)
-                return interpolate(from_base, from_next, share)
-        latest, only = self._poses[-1]
-        return np.asarray(only) if latest == time else None
+        later: tuple[int, Matrix] | None = None
+        for when, world_from_base in reversed(self._poses):
+            if when == time:
+                return world_from_base
+            if when < time:
+                return (
+                    None if later is None else interpolate(world_from_base, later[1], (time - when) / (later[0] - when))
+                )
+            later = when, world_from_base
+        return None

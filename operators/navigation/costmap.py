@@ -1,4 +1,4 @@
-"""The floor as the planner sees it: what the map says and what has been seen, how near it is, and what driving there costs."""
+"""The floor as the planner sees it: what map and lidar say stands there, how near that is, what driving there costs."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ OCCUPIED = 50  # value of a map's cell from which it counts as occupied
 MARGIN = 4.0  # metres of unknown floor kept around all that matters, so that a way can lead around
 
 FREE = 8  # weight of open floor: whole numbers with room for an eighth
-TIGHT = 32  # added to it at the robot's inscribed radius, falling to nothing with the square of the distance
-UNKNOWN = 8  # added where the map knows nothing
+TIGHT = 48  # added to it at the robot's inscribed radius, falling to nothing with the square of the distance
+UNKNOWN = 8  # added where neither map nor lidar have been
+DOUBTFUL = 64  # added instead near the robot: so near, it hides where the lidar is blind
+DOUBT_RADIUS = 1.0  # metres
 ESCAPE = 160  # weight of cells too near to something, around a robot that stands there anyway
 ESCAPE_RADIUS = 0.6  # metres
 
@@ -34,12 +36,11 @@ def weigh(
     lethal: float,
     inflation: float,
     start: tuple[int, int],
-    escape_cells: float,
 ) -> npt.NDArray[np.int32]:
     """Give each coarse cell its weight: BLOCKED below `lethal` metres, falling to FREE at `inflation`.
 
     distance, known (rows, columns) on the fine raster; a coarse cell's distance is the mean of its four. Around `start`
-    (coarse row and column) cells that are not themselves occupied are left open at the weight ESCAPE.
+    (coarse row and column), the robot, cells that are not themselves occupied are left open at the weight ESCAPE.
     """
     rows, columns = distance.shape[0] // COARSE, distance.shape[1] // COARSE
     weights = np.empty((rows, columns), np.int32)
@@ -53,11 +54,13 @@ def weigh(
                     least = min(least, value)
                     seen = seen and known[COARSE * row + down, COARSE * column + right]
             mean = total / (COARSE * COARSE)
-            near = math.sqrt((row - start[0]) ** 2 + (column - start[1]) ** 2) <= escape_cells
+            away = CELL * COARSE * math.sqrt((row - start[0]) ** 2 + (column - start[1]) ** 2)
             if mean < lethal:
-                weights[row, column] = ESCAPE if near and least > 0.0 else BLOCKED
+                weights[row, column] = ESCAPE if away <= ESCAPE_RADIUS and least > 0.0 else BLOCKED
                 continue
-            weight = FREE if seen else FREE + UNKNOWN
+            weight = FREE
+            if not seen:
+                weight += DOUBTFUL if away <= DOUBT_RADIUS else UNKNOWN
             if mean < inflation:
                 closeness = (inflation - mean) / (inflation - lethal)
                 weight += int(TIGHT * closeness * closeness)
@@ -90,7 +93,7 @@ class Costmap:
         self.lattice = lattice
 
     def set_map(self, cells: npt.NDArray[np.int8], origin: npt.ArrayLike, resolution: float) -> None:
-        """Replace the map: cells (rows, columns), -1 unknown, 0 free to 100 occupied; origin of its corner in metres."""
+        """Replace the map: cells (rows, columns) -1 unknown, 0 free to 100 occupied; origin of its corner in metres."""
         lower = np.asarray(origin, np.float64)
         upper = lower + resolution * np.array([cells.shape[1], cells.shape[0]])
         self._grow(lattice_around(CELL, lower - MARGIN, upper + MARGIN, block=BLOCK))
@@ -108,28 +111,41 @@ class Costmap:
         self.obstacles.erase(*where)
         self.cells[where] = np.minimum(self.cells[where], 0)
 
-    def occupied(self) -> npt.NDArray[np.bool_]:
-        """Return (rows, columns): the map or the lidar says that something stands there."""
-        return (self.cells >= OCCUPIED) | self.obstacles.filled
-
     def weights(
-        self, *, lethal: float, inflation: float, robot: tuple[float, float], seen: bool = True
+        self, robot: tuple[float, float], *, lethal: float, inflation: float, seen: bool = True
     ) -> npt.NDArray[np.int32]:
-        """Return the weights of the coarse raster for a search from a robot's position; without what was seen if not `seen`."""
-        taken = self.occupied() if seen else self.cells >= OCCUPIED
+        """Return the coarse raster's weights, for a search to a robot's position; by the map alone if not `seen`."""
+        taken = self.cells >= OCCUPIED
+        if seen:
+            taken |= self.obstacles.filled
         distance = distance_to(taken, CELL, inflation)
-        start = self.lattice.coarse(COARSE).cell(*robot)
-        return weigh(distance, self.cells >= 0, lethal, inflation, start, ESCAPE_RADIUS / (CELL * COARSE))
+        known = (self.cells >= 0) | self.obstacles.seen
+        return weigh(distance, known, lethal, inflation, self.lattice.coarse(COARSE).cell(*robot))
+
+    def distrust(self, x: float, y: float) -> None:
+        """Take for occupied what nobody has seen around a position, as far as it may hide in the lidar's blind ring."""
+        row, column = self.lattice.cell(x, y)
+        reach = math.ceil(DOUBT_RADIUS / CELL)
+        rows, columns = np.mgrid[row - reach : row + reach + 1, column - reach : column + reach + 1]
+        near = (rows - row) ** 2 + (columns - column) ** 2 <= reach * reach
+        near &= (rows >= 0) & (rows < self.lattice.rows) & (columns >= 0) & (columns < self.lattice.columns)
+        rows, columns = rows[near], columns[near]
+        unknown = (self.cells[rows, columns] < 0) & ~self.obstacles.seen[rows, columns]
+        self.obstacles.fill(rows[unknown], columns[unknown])
 
     def window(self, x: float, y: float, side: float, limit: float) -> Surroundings:
-        """Return how near things are, up to `limit` metres, in a square of `side` metres around a position."""
-        cells = round(side / CELL)
+        """Return how near things are, up to `limit` metres, in a square of `side` metres around a position.
+
+        What neither map nor lidar has seen counts as occupied: the robot stops before it, and mostly sees it by then.
+        """
+        half = round(side / CELL) // 2
         row, column = self.lattice.cell(x, y)
-        top, left = row - cells // 2, column - cells // 2
-        rows = slice(max(top, 0), max(min(top + cells, self.lattice.rows), 0))
-        columns = slice(max(left, 0), max(min(left + cells, self.lattice.columns), 0))
-        taken = np.zeros((cells, cells), np.bool_)  # what lies outside of the raster is empty
+        top, left = row - half, column - half
+        rows = slice(max(top, 0), max(min(row + half, self.lattice.rows), 0))
+        columns = slice(max(left, 0), max(min(column + half, self.lattice.columns), 0))
         part = (self.cells[rows, columns] >= OCCUPIED) | self.obstacles.filled[rows, columns]
+        part |= (self.cells[rows, columns] < 0) & ~self.obstacles.seen[rows, columns]
+        taken = np.ones((2 * half, 2 * half), np.bool_)
         taken[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = part
-        x, y = (left + self.lattice.first_column) * CELL, (top + self.lattice.first_row) * CELL
-        return Surroundings(distance_to(taken, CELL, limit), CELL, x, y)
+        corner = (left + self.lattice.first_column) * CELL, (top + self.lattice.first_row) * CELL
+        return Surroundings(distance_to(taken, CELL, limit), CELL, *corner)

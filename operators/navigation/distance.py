@@ -11,7 +11,7 @@ MOST_CELLS = 127  # twice its square is the largest that 16 bits hold
 
 @njit(cache=True)
 def _squared(occupied: npt.NDArray[np.bool_], limit: int) -> npt.NDArray[np.int16]:
-    """Squared distance in cells, true below limit^2: nearest along each row first, then the best row above and below."""
+    """Return squared distances in cells, true below limit^2: along each row first, then over the rows around."""
     rows, columns = occupied.shape
     along = np.empty((rows, columns), np.int16)
     for row in range(rows):
@@ -47,6 +47,6 @@ def distance_to(occupied: npt.NDArray[np.bool_], resolution: float, limit: float
     """
     cells = int(np.ceil(limit / resolution)) + 1
     if cells > MOST_CELLS:
-        raise ValueError(f"A limit of {limit} m is {cells} cells of {resolution} m; at most {MOST_CELLS} can be measured")
+        raise ValueError(f"A limit of {limit} m is {cells} cells of {resolution} m; at most {MOST_CELLS} are measured")
     squares = _squared(occupied, cells)
     return np.minimum(np.sqrt(squares.astype(np.float32)) * np.float32(resolution), np.float32(limit))

@@ -40,7 +40,7 @@ class Footprint(NamedTuple):
 
 
 class Surroundings(NamedTuple):
-    """How near things are: distance (rows, columns) in metres from each cell's centre to that of the nearest occupied cell."""
+    """How near things are: distance (rows, columns) in metres from each cell's centre to the nearest occupied one's."""
 
     distance: npt.NDArray[np.float32]
     resolution: float  # metres
@@ -56,27 +56,35 @@ class Body(NamedTuple):
 
 
 @njit(cache=True)
+def _between(around: Surroundings, column: float, row: float) -> float:
+    """Interpolate the distance to an occupied cell's side, at a place in cells; nothing stands beyond the border."""
+    rows, columns = around.distance.shape
+    low_row, low_column = math.floor(row - 0.5), math.floor(column - 0.5)
+    if low_row < 0 or low_row + 1 >= rows or low_column < 0 or low_column + 1 >= columns:
+        return math.inf
+    down, right = row - 0.5 - low_row, column - 0.5 - low_column
+    lower = (1.0 - right) * around.distance[low_row, low_column] + right * around.distance[low_row, low_column + 1]
+    upper = (1.0 - right) * around.distance[low_row + 1, low_column]
+    upper += right * around.distance[low_row + 1, low_column + 1]
+    return (1.0 - down) * lower + down * upper - 0.5 * around.resolution
+
+
+@njit(cache=True)
 def room(around: Surroundings, body: Body, enough: float, x: float, y: float, yaw: float) -> float:
-    """Return the distance in metres between the outline and the nearest occupied cell's centre, or a lower bound >= enough.
+    """Return the metres between the outline and the nearest occupied cell's side, or a lower bound >= enough.
 
     Beyond the surroundings nothing is known to stand: there it is `enough`.
     """
-    rows, columns = around.distance.shape
-    x, y = x - around.x, y - around.y
-    row, column = math.floor(y / around.resolution), math.floor(x / around.resolution)
-    if row < 0 or row >= rows or column < 0 or column >= columns:
-        return enough
-    least = float(around.distance[row, column]) - body.circumscribed
+    column, row = (x - around.x) / around.resolution, (y - around.y) / around.resolution
+    least = _between(around, column, row) - body.circumscribed
     if least >= enough:
         return least
     least = enough
-    cosine, sine = math.cos(yaw), math.sin(yaw)
+    cosine, sine = math.cos(yaw) / around.resolution, math.sin(yaw) / around.resolution
     for index in range(len(body.outline)):
         forward, left = body.outline[index, 0], body.outline[index, 1]
-        row = math.floor((y + sine * forward + cosine * left) / around.resolution)
-        column = math.floor((x + cosine * forward - sine * left) / around.resolution)
-        if 0 <= row < rows and 0 <= column < columns:
-            least = min(least, float(around.distance[row, column]))
+        place = _between(around, column + cosine * forward - sine * left, row + sine * forward + cosine * left)
+        least = min(least, place)
     return least
 
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 
 class Lattice(NamedTuple):
-    """A rectangle of cells; cell (row, column) covers resolution * (first_column + column .. + 1, first_row + row .. + 1)."""
+    """A rectangle of cells; that of (row, column) begins at resolution * (first_column + column, first_row + row)."""
 
     resolution: float  # metres
     first_row: int
@@ -46,7 +46,7 @@ class Lattice(NamedTuple):
         return self.inside(*self.cell(x - margin, y - margin)) and self.inside(*self.cell(x + margin, y + margin))
 
     def coarse(self, factor: int) -> Lattice:
-        """Return the raster of cells `factor` times as long. Raises ValueError when the borders do not fall together."""
+        """Return the raster of cells `factor` times as long. Raises ValueError when the borders do not coincide."""
         if any(number % factor for number in self[1:]):
             raise ValueError(f"A raster of {self[1:]} cells does not divide by {factor}")
         return Lattice(self.resolution * factor, *(number // factor for number in self[1:]))
@@ -68,7 +68,7 @@ def union(a: Lattice, b: Lattice) -> Lattice:
 
 
 def moved(cells: npt.NDArray[Any], source: Lattice, target: Lattice, fill: float) -> npt.NDArray[Any]:
-    """Copy cells (rows, columns, ...) of one raster onto another of the same resolution; `fill` where there are none."""
+    """Copy cells (rows, columns, ...) of one raster onto another of its resolution; `fill` where there are none."""
     result = np.full((target.rows, target.columns, *cells.shape[2:]), fill, cells.dtype)
     row, column = source.first_row - target.first_row, source.first_column - target.first_column
     top, left = max(row, 0), max(column, 0)
@@ -81,7 +81,7 @@ def moved(cells: npt.NDArray[Any], source: Lattice, target: Lattice, fill: float
 def resampled(
     cells: npt.NDArray[Any], origin: npt.ArrayLike, resolution: float, target: Lattice
 ) -> npt.NDArray[np.int8]:
-    """Put a foreign grid (origin in metres, any resolution) onto a raster; the greatest value wins, -1 where there is none.
+    """Put a foreign grid (origin in metres, any resolution) onto a raster; the greatest value wins, -1 where none is.
 
     Cells larger than the raster's are spread over all that they cover; smaller ones are gathered.
     """

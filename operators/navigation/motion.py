@@ -20,7 +20,7 @@ class Twist(NamedTuple):
 def advance(
     x: float, y: float, yaw: float, linear: float, angular: float, seconds: float
 ) -> tuple[float, float, float]:
-    """Move a pose along an arc of constant velocities (midpoint rule: exact in heading, 0.04 % of the way at 1 rad/s, 0.1 s)."""
+    """Move a pose along an arc of constant velocities (midpoint rule: 0.04 % of the way too far at 0.1 rad)."""
     middle = yaw + 0.5 * angular * seconds
     return x + linear * seconds * math.cos(middle), y + linear * seconds * math.sin(middle), yaw + angular * seconds
 

@@ -24,11 +24,11 @@ NEARBY = 0.75  # metres around a target that is itself blocked: a place there se
 NEARBY_COST = 3.0  # metres of open floor that each metre from the blocked target counts
 PATIENCE = 120  # periods without any way after which a target is called unreachable
 STILL, STILL_TURN = 0.15, 0.6  # metres and radians: moving less than this
-STILL_FOR = 40  # periods, is being stuck
+STILL_FOR = 30  # periods, is being stuck
 ATTEMPTS = 8  # recoveries within FRESH metres after which a target is called unreachable
 FRESH = 1.0  # metres
 REST = 200  # periods after which an unreachable target is tried again
-BLIND_SPEED = 0.4  # m/s at most, while the localizer is not sure
+CAREFUL_SPEED = 0.4  # m/s at most, while the localizer is not sure
 BRAKE = 2.0  # times the usual acceleration, when every arc ends in something
 
 
@@ -66,7 +66,7 @@ class Navigator:
         footprint: Footprint | None = None,
         limits: Limits | None = None,
         *,
-        padding: float = 0.04,
+        padding: float = 0.05,
         inflation: float = 0.8,
         side: float = 4.0,
         horizon: float = 3.0,
@@ -74,8 +74,8 @@ class Navigator:
     ) -> None:
         """Take lengths in metres and times in seconds.
 
-        padding: kept free around the footprint; inflation: distance up to which the search keeps away from things; side: of the
-        local window; horizon: of the arcs; latency: from a measurement to the effect of the command that answers it.
+        padding: kept free around the footprint; inflation: distance up to which the search keeps away from things;
+        side: of the local window; horizon: of the arcs; latency: from a measurement to the effect of its command.
         """
         self.footprint = footprint or Footprint()
         self.limits = limits or Limits()
@@ -135,6 +135,8 @@ class Navigator:
         self._until_replan -= 1
         if self._without_way > PATIENCE:
             return self._decide(measured_at, Twist(), pose, "unreachable")
+        if math.dist(pose[:2], self._attempt_place) > FRESH:
+            self._attempts, self._attempt_place = 0, (pose[0], pose[1])
         around = self.costmap.window(pose[0], pose[1], self._side, self._side / 4.0)
         if self._recovery is None and self._stuck(pose):
             self._recover(pose)
@@ -142,7 +144,7 @@ class Navigator:
             twist = self._get_loose(pose, around)
             if twist is not None:
                 return self._decide(measured_at, twist, pose, "recover")
-        return self._follow(measured_at, pose, around, BLIND_SPEED if not valid else self.limits.speed)
+        return self._follow(measured_at, pose, around, self.limits.speed if valid else CAREFUL_SPEED)
 
     def _search(self, pose: tuple[float, float, float]) -> None:
         """Search from the goal; when what was seen leaves no way, by the map alone: people move on, and doors open."""
@@ -150,10 +152,10 @@ class Navigator:
         self._until_replan = REPLAN
         lattice = self.costmap.lattice.coarse(COARSE)
         start = lattice.cell(pose[0], pose[1])
-        lethal = self.footprint.inscribed + self.window.padding
+        lethal = self.footprint.inscribed + self.window.padding + 0.5 * CELL
         per_metre = FREE * UNIT / lattice.resolution
         for seen in (True, False):
-            weights = self.costmap.weights(lethal=lethal, inflation=self._inflation, robot=pose[:2], seen=seen)
+            weights = self.costmap.weights(pose[:2], lethal=lethal, inflation=self._inflation, seen=seen)
             sources, costs = self._sources(weights, lattice, per_metre)
             field = cost_to_go(weights, sources, costs, start=start, margin=round(BEYOND * per_metre))
             found = field.cost[start] != UNREACHED
@@ -190,9 +192,11 @@ class Navigator:
         return bool(away < STILL and np.abs(wrap(trail[:, 2] - pose[2])).max() < STILL_TURN)
 
     def _recover(self, pose: tuple[float, float, float]) -> None:
-        """Start getting loose, or give up for a while after too many attempts in one place."""
-        if math.dist(pose[:2], self._attempt_place) > FRESH:
-            self._attempts, self._attempt_place = 0, (pose[0], pose[1])
+        """Start getting loose, or give up for a while after too many attempts in one place.
+
+        What the robot stood before and could not see, it takes for an obstacle from now on, until a ray passes there.
+        """
+        self.costmap.distrust(pose[0], pose[1])
         if self._attempts == ATTEMPTS:
             self._attempts, self._given_up = 0, REST
         ahead = self._path[min(6, len(self._path) - 1)] if len(self._path) else np.array(self._goal)

@@ -1,8 +1,8 @@
 """What stands in the way: cells above the floor that the lidar has hit, kept until it looks through them.
 
-Each column of the raster holds eleven voxels, 0.1 m high, from 0.1 to 1.2 m above the floor. A hit fills its voxel. A frame's
-rays, gathered in a panorama of nearest ranges, wear off every voxel that they pass through; after LIFE frames it is empty.
-Nothing is forgotten for not being seen: what enters the lidar's blind ring, or hides behind something, stays.
+Each column of the raster holds eleven voxels, 0.1 m high, from 0.1 to 1.2 m above the floor. A hit fills its voxel. A
+frame's rays, gathered in a panorama of nearest ranges, wear off each voxel that they pass through; after LIFE frames it
+is empty. Nothing is forgotten for not being seen: what enters the lidar's blind ring, or hides behind something, stays.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ LEVEL = 0.1  # metres
 LEVELS = 11
 LIFE = 5  # frames of looking through a voxel that empty it
 SLOPE = 0.005  # metres a metre: how much the floor may seem to rise with distance, by a tilt of the pose
-BLIND = 0.95  # metres from the lidar: nearer things send no echo
-LOWEST_BEAM = math.radians(-30.0)
-SILENCE = 20  # frames after which a voxel in plain sight is dropped though no ray came back from behind it
 
-AZIMUTHS = 720
+SECTORS = 1080  # a third of a degree, one cell at 8.6 m
+LOOK = 5.0  # metres: how far free floor is entered
+
+AZIMUTHS = 480
 FIRST_ELEVATION, ELEVATION_STEP, ELEVATIONS = math.radians(-40.0), math.radians(2.0 / 3.0), 120
 NOTHING = np.float32(1e9)  # range of a panorama cell without a return
 
 
 @njit(cache=True)
 def panorama(points: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Return the nearest range by elevation and azimuth, (ELEVATIONS, AZIMUTHS) metres, of points (n, 3) in the lidar frame."""
+    """Return the nearest range (ELEVATIONS, AZIMUTHS) in metres of points (n, 3) in the lidar frame."""
     image = np.full((ELEVATIONS, AZIMUTHS), NOTHING, np.float32)
     for index in range(len(points)):
-        x, y, z = float(points[index, 0]), float(points[index, 1]), float(points[index, 2])
+        x, y, z = np.float64(points[index, 0]), np.float64(points[index, 1]), np.float64(points[index, 2])
         flat = math.sqrt(x * x + y * y)
         row = math.floor((math.atan2(z, flat) - FIRST_ELEVATION) / ELEVATION_STEP)
         column = math.floor(math.atan2(y, x) * (AZIMUTHS / (2.0 * math.pi))) % AZIMUTHS
@@ -57,7 +57,8 @@ def _glance(
     distance = math.sqrt(flat * flat + z * z)
     passed, ended, covered = False, False, False
     for row in range(max(lower, 0), min(upper, ELEVATIONS - 1) + 1):
-        seen = image[row, column]
+        # The nearest of three columns: along a wall one ray hits it well behind a voxel, the next one well before.
+        seen = min(image[row, column - 1], image[row, column], image[row, (column + 1) % AZIMUTHS])
         if seen < NOTHING:
             if seen > distance + margin:
                 passed = True
@@ -80,51 +81,49 @@ def _moved(pose: npt.NDArray[np.float64], x: float, y: float, z: float) -> tuple
 @njit(cache=True)
 def wear(
     life: npt.NDArray[np.uint8],
-    hit_frame: npt.NDArray[np.int32],
     filled: npt.NDArray[np.bool_],
     image: npt.NDArray[np.float32],
     lidar_from_world: npt.NDArray[np.float64],
     floor: float,
-    frame: int,
     corner: tuple[float, float],
     resolution: float,
     box: tuple[int, int, int, int],
 ) -> None:
-    """Take life from the voxels within a box of cells (rows, columns: from, to) that this frame's rays passed through."""
+    """Take life from the voxels within a box (rows, then columns: from, to) that this frame's rays passed through."""
     margin = 2.0 * resolution
     for row in range(box[0], box[1]):
         for column in range(box[2], box[3]):
             if not filled[row, column]:
                 continue
             world_x, world_y = corner[0] + (column + 0.5) * resolution, corner[1] + (row + 0.5) * resolution
-            remaining = False
+            emptied, seen, remaining = False, False, False
             for level in range(LEVELS):
                 if life[row, column, level] == 0:
                     continue
                 world_z = floor + LOWEST + (level + 0.5) * LEVEL
                 x, y, z = _moved(lidar_from_world, world_x, world_y, world_z)
                 passed, ended, covered = _glance(image, x, y, z, 0.5 * LEVEL, margin)
-                if ended:
-                    pass
-                elif passed:
+                if passed and not ended:
                     life[row, column, level] -= 1
-                elif not covered and frame - hit_frame[row, column] > SILENCE:
-                    flat = math.sqrt(x * x + y * y)
-                    if flat * flat + z * z > BLIND * BLIND and math.atan2(z - 0.5 * LEVEL, flat) > LOWEST_BEAM:
-                        life[row, column, level] = 0
-                remaining = remaining or life[row, column, level] > 0
+                    emptied = emptied or life[row, column, level] == 0
+                if life[row, column, level] > 0:
+                    seen = seen or passed or ended or covered
+                    remaining = True
+            if emptied and remaining and not seen:
+                # Its upper part has gone; the lower, of which no ray tells (below all beams, or rays to the floor are
+                # left out of the frame), went with it.
+                life[row, column] = 0
+                remaining = False
             filled[row, column] = remaining
 
 
 @njit(cache=True)
 def strike(
     life: npt.NDArray[np.uint8],
-    hit_frame: npt.NDArray[np.int32],
     filled: npt.NDArray[np.bool_],
     points: npt.NDArray[np.float32],
     world_from_lidar: npt.NDArray[np.float64],
     floor: float,
-    frame: int,
     corner: tuple[float, float],
     resolution: float,
     reach: float,
@@ -133,7 +132,7 @@ def strike(
     rows, columns = filled.shape
     pose = world_from_lidar
     for index in range(len(points)):
-        x, y, z = float(points[index, 0]), float(points[index, 1]), float(points[index, 2])
+        x, y, z = np.float64(points[index, 0]), np.float64(points[index, 1]), np.float64(points[index, 2])
         world_x, world_y, world_z = _moved(pose, x, y, z)
         away = math.sqrt((world_x - pose[0, 3]) ** 2 + (world_y - pose[1, 3]) ** 2)
         if away > reach:
@@ -145,35 +144,71 @@ def strike(
         column = math.floor((world_x - corner[0]) / resolution)
         if 0 <= row < rows and 0 <= column < columns:
             life[row, column, min(int((height - LOWEST) / LEVEL), LEVELS - 1)] = LIFE
-            hit_frame[row, column] = frame
             filled[row, column] = True
 
 
+@njit(cache=True)
+def look(
+    seen: npt.NDArray[np.bool_],
+    points: npt.NDArray[np.float32],
+    world_from_lidar: npt.NDArray[np.float64],
+    floor: float,
+    corner: tuple[float, float],
+    resolution: float,
+    reach: float,
+) -> None:
+    """Mark the columns that rays passed through: in each sector up to its nearest hit, or to its farthest floor.
+
+    A sector without a return proves nothing: what stands in the blind ring swallows its rays.
+    """
+    pose = world_from_lidar
+    nearest, farthest = np.full(SECTORS, np.inf), np.zeros(SECTORS)
+    for index in range(len(points)):
+        x, y, z = np.float64(points[index, 0]), np.float64(points[index, 1]), np.float64(points[index, 2])
+        world_x, world_y, world_z = _moved(pose, x, y, z)
+        across, along = world_x - pose[0, 3], world_y - pose[1, 3]
+        away = math.sqrt(across * across + along * along)
+        sector = math.floor(math.atan2(along, across) * (SECTORS / (2.0 * math.pi))) % SECTORS
+        height = world_z - floor
+        if LOWEST + SLOPE * away <= height < HIGHEST:
+            nearest[sector] = min(nearest[sector], away)
+        farthest[sector] = max(farthest[sector], away)
+    rows, columns = seen.shape
+    for sector in range(SECTORS):
+        end = min(reach, nearest[sector] if nearest[sector] < np.inf else farthest[sector])
+        angle = (sector + 0.5) * (2.0 * math.pi / SECTORS)
+        across, along = math.cos(angle), math.sin(angle)
+        for step in range(int(end / resolution)):
+            away = (step + 0.5) * resolution
+            row = math.floor((pose[1, 3] + away * along - corner[1]) / resolution)
+            column = math.floor((pose[0, 3] + away * across - corner[0]) / resolution)
+            if 0 <= row < rows and 0 <= column < columns:
+                seen[row, column] = True
+
+
 class ObstacleLayer:
-    """The columns that hold something, on a raster that grows with the world. 16 bytes a cell."""
+    """The columns that hold something, on a raster that grows with the world. 13 bytes a cell."""
 
     def __init__(self, lattice: Lattice, *, reach: float = 8.0) -> None:
         """Start empty. reach: metres around the lidar within which things are entered and removed."""
         self.lattice = lattice
         self.reach = reach
-        self.frame = 0
         shape = lattice.rows, lattice.columns
         self._life = np.zeros((*shape, LEVELS), np.uint8)
-        self._hit_frame = np.zeros(shape, np.int32)
         self.filled = np.zeros(shape, np.bool_)  # (rows, columns): something stands here
+        self.seen = np.zeros(shape, np.bool_)  # (rows, columns): a ray has passed here
 
     def grow(self, lattice: Lattice) -> None:
         """Move onto a larger raster."""
         self._life = moved(self._life, self.lattice, lattice, 0)
-        self._hit_frame = moved(self._hit_frame, self.lattice, lattice, 0)
         self.filled = moved(self.filled, self.lattice, lattice, False)
+        self.seen = moved(self.seen, self.lattice, lattice, False)
         self.lattice = lattice
 
     def observe(
         self, points: npt.NDArray[np.float32], world_from_lidar: npt.NDArray[np.float64], floor: float = 0.0
     ) -> None:
         """Enter a frame: points (n, 3) in the lidar frame; floor: its height in the world, metres."""
-        self.frame += 1
         pose = np.array(world_from_lidar, np.float64)  # a copy: messages are read-only, which is another type to numba
         points = np.array(points, np.float32)
         cells = math.ceil(self.reach / self.lattice.resolution)
@@ -184,12 +219,19 @@ class ObstacleLayer:
             max(column - cells, 0),
             min(column + cells + 1, self.lattice.columns),
         )
-        layers = self._life, self._hit_frame, self.filled
+        layers = self._life, self.filled
         place = self.lattice.origin, self.lattice.resolution
-        wear(*layers, panorama(points), inverse(pose), floor, self.frame, *place, box)
-        strike(*layers, points, pose, floor, self.frame, *place, self.reach)
+        wear(*layers, panorama(points), inverse(pose), floor, *place, box)
+        strike(*layers, points, pose, floor, *place, self.reach)
+        look(self.seen, points, pose, floor, *place, LOOK)
 
     def erase(self, rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64]) -> None:
-        """Empty columns of the raster by their indices (n,)."""
+        """Empty columns of the raster by their indices (n,): they are known to be free."""
         self._life[rows, columns] = 0
         self.filled[rows, columns] = False
+        self.seen[rows, columns] = True
+
+    def fill(self, rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64]) -> None:
+        """Fill columns of the raster by their indices (n,), at the height of the lidar's level beams."""
+        self._life[rows, columns, LEVELS // 2] = LIFE
+        self.filled[rows, columns] = True

@@ -11,15 +11,17 @@ from numba import njit
 BLOCKED = 0  # weight of a cell that nothing may enter
 UNREACHED = np.int32(2**31 - 1)
 
-# A step's cost is its length times the mean weight of the cells that it touches, in units that keep it whole: 24 a cell of
-# weight 1. 12, 17 and 27 are 12 times 1, sqrt(2) and sqrt(5), to 0.6 %; with knight's moves the longest detour that the
-# raster forces on a straight way is 3 %, with eight neighbours it would be 8 %.
+# A step's cost is its length times the mean weight of the cells that it touches, in units that keep it whole: 24 a cell
+# of weight 1. 12, 17 and 27 are 12 times 1, sqrt(2) and sqrt(5), to 0.6 %; with knight's moves the longest detour that
+# the raster forces on a straight way is 3 %, with eight neighbours it would be 8 %.
 UNIT = 24
 STRAIGHT, DIAGONAL, KNIGHT = 12, 17, 27
 FRAME = 2  # cells around the grid, the reach of a knight's move
 MOVES = np.array(
-    [(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)]
-    + [(1, 2), (2, 1), (2, -1), (1, -2), (-1, -2), (-2, -1), (-2, 1), (-1, 2)],
+    [
+        *[(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)],
+        *[(1, 2), (2, 1), (2, -1), (1, -2), (-1, -2), (-2, -1), (-2, 1), (-1, 2)],
+    ],
     np.int64,
 )  # (16, row and column)
 
@@ -70,7 +72,7 @@ def _search(
     target: int,
     margin: int,
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-    """Settle cells in the order of buckets as wide as the cheapest step: within one, none can improve another (Dial)."""
+    """Settle cells by buckets as wide as the cheapest step: within one, none can improve another (Dial)."""
     cells = len(weights)
     cost = np.full(cells, UNREACHED, np.int32)
     following = np.full(cells, -1, np.int32)
@@ -118,7 +120,7 @@ def _search(
                     reached = so_far + STRAIGHT * (here + there)
                 else:
                     first, second = weights[flat + moves[move, 1]], weights[flat + moves[move, 2]]
-                    if first == BLOCKED or second == BLOCKED:
+                    if BLOCKED in (first, second):
                         continue  # it would cut a corner
                     if move < 8:
                         reached = so_far + DIAGONAL * (here + there)
@@ -146,8 +148,8 @@ def cost_to_go(
 ) -> Field:
     """Find the cheapest way from every cell to the nearest source.
 
-    weights (rows, columns): 0 blocked, else at least 1. sources: flat indices of the goal cells; starting_costs: what each
-    costs by itself, 0 by default. start: stop when everything up to the cost of this cell plus `margin` is settled; cells
+    weights (rows, columns): 0 blocked, else at least 1. sources: flat indices of the goal cells; starting_costs: what
+    each costs by itself, 0 by default. start: stop when all is settled up to the cost of this cell plus `margin`; cells
     beyond keep an upper bound. The order of settling is fixed, so that equal inputs give equal ways.
     Source: Dijkstra 1959; buckets: Dial 1969.
     """

@@ -1,8 +1,8 @@
 """The dynamic window: of all velocities within reach, the one whose arc brings the robot to the goal soonest.
 
-Every arc is judged in seconds: the time to some point along it, the time that the search says is left from there, the time
-to turn towards the way there, and a surcharge for passing close. Only points count from which the robot can still stop
-before it touches anything. Source: Fox, Burgard and Thrun 1997; with the way's cost as the goal term, Brock and Khatib 1999.
+Every arc is judged in seconds: the time to some point along it, the time that the search says is left from there, the
+time to turn towards the way there, and a surcharge for passing close. Only points count from which the robot can still
+stop before it touches anything. Source: Fox, Burgard and Thrun 1997; the way's cost as goal: Brock and Khatib 1999.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from operators.navigation.search import UNREACHED, Field
 
 STEP = 0.1  # seconds between the poses of an arc: one period of the controller
 COMFORT = 0.3  # metres of room from which passing costs nothing
-CLOSE_COST = 1.0  # seconds a second with no room at all
+CLOSE_COST = 6.0  # seconds for each second's way at full speed with no room at all
 CREEP, SPEED_PER_ROOM = 0.3, 3.0  # m/s with no room, and m/s more for each metre of it
 HASTE_COST = 4.0  # seconds a second, at twice the speed that the room allows
-TURN_COST = 0.7  # of the time that a turn on the spot towards the way would take: driving and turning overlap
+TURN_COST = 1.3  # of the time that a turn towards the way takes: above 1, or the robot would never begin to turn
 SWERVE_COST = 0.05  # seconds for each rad/s that the turn differs from the last choice: no dithering between equals
 REVERSE_COST = 1.0  # seconds a second: the robot sees backwards as well, but is not meant to drive so
 NOWHERE = 1e3  # seconds left from where no way leads to the goal
@@ -113,21 +113,22 @@ def seconds_left(way: Way, x: float, y: float) -> float:
 def _roll(
     poses: npt.NDArray[np.float64],
     speeds: npt.NDArray[np.float64],
+    turns: npt.NDArray[np.float64],
     rooms: npt.NDArray[np.float64],
-    turn: float,
     wanted: tuple[float, float],
     limits: Limits,
     around: Surroundings,
     body: Body,
     padding: float,
 ) -> int:
-    """Fill in poses (steps + 1, 3), speeds and rooms (steps + 1,) from the first; return the last step before a touch."""
-    speed = speeds[0]
+    """Fill in poses (steps + 1, 3), speeds, turns and rooms (steps + 1,); return the last step before a touch."""
+    speed, turn = speeds[0], turns[0]
     for k in range(1, len(poses)):
         speed = towards(speed, wanted[0], limits.acceleration * STEP)
         turn = towards(turn, wanted[1], limits.turn_acceleration * STEP)
         x, y, yaw = advance(poses[k - 1, 0], poses[k - 1, 1], poses[k - 1, 2], speed, turn, STEP)
-        poses[k, 0], poses[k, 1], poses[k, 2], speeds[k] = x, y, yaw, speed
+        poses[k, 0], poses[k, 1], poses[k, 2] = x, y, yaw
+        speeds[k], turns[k] = speed, turn
         rooms[k] = room(around, body, COMFORT, x, y, yaw)
         if rooms[k] < padding:
             return k - 1
@@ -138,6 +139,7 @@ def _roll(
 def _judge(
     poses: npt.NDArray[np.float64],
     speeds: npt.NDArray[np.float64],
+    turns: npt.NDArray[np.float64],
     rooms: npt.NDArray[np.float64],
     free: int,
     limits: Limits,
@@ -156,7 +158,7 @@ def _judge(
         if rooms[k] < COMFORT:
             closeness = (COMFORT - rooms[k]) / COMFORT
             haste = max(0.0, pace / (CREEP + SPEED_PER_ROOM * rooms[k]) - 1.0)
-            spent += STEP * (CLOSE_COST * closeness * closeness + HASTE_COST * haste)
+            spent += STEP * (CLOSE_COST * closeness * closeness * pace / limits.speed + HASTE_COST * haste)
         if speeds[k] < 0.0:
             spent += STEP * REVERSE_COST
         if to_touch < pace * pace / (2.0 * limits.acceleration):
@@ -166,10 +168,15 @@ def _judge(
         if row < 0 or row >= way.seconds.shape[0] or column < 0 or column >= way.seconds.shape[1]:
             break
         total = spent + seconds_left(way, poses[k, 0], poses[k, 1])
+        missing = limits.speed - speeds[k]  # what is still to be gained costs the time that it takes
+        total += missing * missing / (2.0 * limits.acceleration * limits.speed)
         ahead = float(way.direction[row, column])
         if not math.isnan(ahead):
-            off = abs((ahead - poses[k, 2] + math.pi) % (2.0 * math.pi) - math.pi)
+            coming = turns[k] * abs(turns[k]) / (2.0 * limits.turn_acceleration)  # before the turn can end
+            off = abs((ahead - poses[k, 2] - coming + math.pi) % (2.0 * math.pi) - math.pi)
             total += TURN_COST * off / limits.turn
+            # Turning at speed leads away from the way by speed / turn * (1 - cos), and costs as much to come back.
+            total += 2.0 * pace * (1.0 - math.cos(off)) / (limits.turn * limits.speed)
         if total < best:
             best, at = total, k
     return best, at
@@ -191,17 +198,18 @@ def _choose(
     way: Way,
 ) -> tuple[float, float, float, npt.NDArray[np.float64]]:
     poses = np.empty((steps + 1, 3))
-    speeds, rooms = np.empty(steps + 1), np.empty(steps + 1)
-    poses[0, 0], poses[0, 1], poses[0, 2], speeds[0] = start[0], start[1], start[2], speed_now
+    speeds, turns, rooms = np.empty(steps + 1), np.empty(steps + 1), np.empty(steps + 1)
+    poses[0, 0], poses[0, 1], poses[0, 2] = start
+    speeds[0], turns[0] = speed_now, turn_now
     here = room(around, body, COMFORT, start[0], start[1], start[2])
-    needed = min(padding, here - 0.005)  # who already stands closer may leave, not press on
+    needed = min(padding, here)  # who already stands closer may leave, not come closer still
     best, best_speed, best_turn = math.inf, 0.0, 0.0
     trajectory = poses[:1].copy()
     for i in range(len(speeds_wanted)):
         for j in range(len(turns_wanted)):
             wanted = (speeds_wanted[i], turns_wanted[j])
-            free = _roll(poses, speeds, rooms, turn_now, wanted, limits, around, body, needed)
-            total, at = _judge(poses, speeds, rooms, free, limits, way)
+            free = _roll(poses, speeds, turns, rooms, wanted, limits, around, body, needed)
+            total, at = _judge(poses, speeds, turns, rooms, free, limits, way)
             total += SWERVE_COST * abs(turns_wanted[j] - turn_before)
             if total < best:
                 best, best_speed, best_turn = total, wanted[0], wanted[1]
@@ -218,11 +226,11 @@ class DynamicWindow:
         limits: Limits,
         *,
         horizon: float = 3.0,
-        padding: float = 0.04,
+        padding: float = 0.05,
         speeds: int = 10,
         turns: int = 21,
     ) -> None:
-        """Take horizon: seconds of an arc; padding: metres kept free around the outline; numbers of sampled velocities."""
+        """Take horizon: seconds of an arc; padding: metres kept free around the outline; how many velocities to try."""
         self.limits = limits
         self.steps = round(horizon / STEP)
         self.padding = padding
