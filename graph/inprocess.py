@@ -11,7 +11,7 @@ from pathlib import Path
 from graph.errors import UserError
 from graph.graphfile import Graph
 from graph.ledger import INFINITY, Mark, Step
-from graph.lockstep import Lockstep
+from graph.lockstep import EndlessError, Lockstep
 from graph.merge import merge
 from graph.node import STREAM, Emission, Node, build_operator
 from graph.realtime import Realtime
@@ -33,8 +33,6 @@ class Local:
         self.schedule: Lockstep | Realtime = Realtime(spec) if spec.kind == "sink" else Lockstep(spec)
         self.deliver = deliver
         self.emissions: list[Emission] = []
-        self.own_end: int | None = None
-        self.promised = -1
         self.done = False
 
     def emit(self, emission: Emission) -> None:
@@ -51,12 +49,11 @@ class Local:
         self.write(self.node.start(self.emit))
         if isinstance(self.schedule, Lockstep):
             self.schedule.started = True
-            self.fetch(0)
+            self.fetch()
 
-    def fetch(self, floor: int) -> None:
+    def fetch(self) -> None:
         """Look at the next item of a source's stream."""
         if self.spec.kind == "source" and isinstance(self.schedule, Lockstep):
-            self.schedule.stream_stamp = floor
             stamp = self.node.peek()
             self.schedule.offer(INFINITY if stamp is None else stamp)
 
@@ -70,9 +67,8 @@ class Local:
         if arrival is not None:
             step = self.node.handle(arrival, arrival.time, self.emit)
             if step.port == STREAM:
-                self.fetch(arrival.time)
+                self.fetch()
             if step.ended is not None and self.spec.end == self.spec.name and isinstance(schedule, Lockstep):
-                self.own_end = arrival.time
                 schedule.finish_at(arrival.time)
             self.write(step)
             return True
@@ -81,14 +77,13 @@ class Local:
             schedule.finished = self.done = True
             self.write(step)
             return True
+        if isinstance(schedule, Lockstep) and schedule.stranded():
+            raise EndlessError(self.spec.name)
         return False
 
     def mark(self) -> Mark | None:
         """Return the mark to tell the others, if it is news."""
-        if not isinstance(self.schedule, Lockstep) or (watermark := self.schedule.watermark()) <= self.promised:
-            return None
-        self.promised = watermark
-        return Mark(watermark, tuple(self.node.counts.values()), self.own_end)
+        return self.schedule.news(tuple(self.node.counts.values())) if isinstance(self.schedule, Lockstep) else None
 
 
 def launch_in_process(

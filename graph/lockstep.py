@@ -19,6 +19,13 @@ class GapError(RuntimeError):
     """A message that was announced never came."""
 
 
+class EndlessError(RuntimeError):
+    """The operator that is to end the run can never say so."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"clock.end names {name}; all that {name} listens to has ended, and it has not said End")
+
+
 class Arrival(NamedTuple):
     """Something to handle: its order, and its content."""
 
@@ -72,7 +79,9 @@ class Lockstep:
         self.started = False
         self.finished = False
         self.handled = -1  # stamp of the last call
-        self.stream_stamp = -1 if spec.kind == "source" else INFINITY  # nothing below comes from the own stream
+        self.streaming = spec.kind == "source"
+        self.stream_stamp = -1 if self.streaming else INFINITY  # nothing below comes from the own stream
+        self.promised = -1
 
     def deliver(self, topic: str, incarnation: int, sequence: int, stamp: int, payload: bytes) -> None:
         """Take a message off the wire. Raises GapError if one before it is missing."""
@@ -101,10 +110,16 @@ class Lockstep:
             self.flow[operator] = max(self.flow[operator], watermark)
 
     def offer(self, stamp: int, payload: bytes | None = None) -> None:
-        """Queue the next item of a source's stream; INFINITY says that there are no more."""
+        """Queue the next item of a source's stream; INFINITY says that there are no more, which ends a run that it is to end."""
+        if not self.streaming:
+            return  # a person stopped the run
+        if stamp >= INFINITY:
+            self.streaming, self.stream_stamp = False, INFINITY
+            if self.spec.end == self.spec.name:
+                self.finish_at(max(self.handled, 0))
+            return
         self.stream_stamp = stamp
-        if stamp < INFINITY:
-            heapq.heappush(self.pending, Arrival(stamp, -1, 0, 0, payload))
+        heapq.heappush(self.pending, Arrival(stamp, -1, 0, 0, payload))
 
     def edges_at(self) -> int:
         """Return the stamp through which everything that can ever arrive is here."""
@@ -133,6 +148,7 @@ class Lockstep:
     def finish_at(self, stamp: int) -> None:
         """Let the run end at a stamp: by this operator's own End, or because a person stopped it."""
         self.end = min(self.end, stamp)
+        self.streaming, self.stream_stamp = False, INFINITY
 
     def complete(self) -> bool:
         """Say whether everything through the end has been handled, so that on_end may run."""
@@ -148,8 +164,24 @@ class Lockstep:
             return INFINITY
         if not self.started:
             return -1
-        horizon = min(self.edges_at(), self.end - 1)
-        return min(horizon, self.pending[0].time - 1) if self.pending else horizon
+        horizon = min(self.edges_at(), self.end - 1, self.control)  # on_end speaks at the end, which may come after control
+        if self.pending:
+            return min(horizon, self.pending[0].time - 1)
+        if self.streaming and self.spec.end == self.spec.name:
+            return min(horizon, self.handled - 1)  # the last item may have been the last: then the run ends at it
+        return horizon
+
+    def news(self, counts: tuple[int, ...]) -> Mark | None:
+        """Return the mark to tell the others, if it promises more than the last; `counts` as in Mark."""
+        if (watermark := self.watermark()) <= self.promised:
+            return None
+        self.promised = watermark
+        return Mark(watermark, counts, self.end if self.spec.end == self.spec.name and self.end < INFINITY else None)
+
+    def stranded(self) -> bool:
+        """Say whether this operator is to end the run, has not said End, and will never be called again."""
+        waiting = self.started and self.spec.end == self.spec.name and self.end == INFINITY
+        return waiting and not self.pending and self.edges_at() >= INFINITY - 1
 
     def gaps(self) -> list[str]:
         """Name the messages that were announced and have not come."""

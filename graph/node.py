@@ -55,17 +55,26 @@ class Node:
         self.summary: Summary | None = None
         self.stream: Iterator[tuple[int, Any]] | None = None
         self.peeked: Any = None
+        self.last_stamp = -1  # of the stream
 
     def peek(self) -> int | None:
-        """Fetch the next item of a source's stream and return its stamp; None when there are no more."""
+        """Fetch the next item of a source's stream and return its stamp; None when there are no more.
+
+        Raises OutputError where stamps do not increase strictly.
+        """
         assert isinstance(self.operator, Source)
         if self.stream is None:
             self.stream = iter(self.operator.stream())
         item = next(self.stream, None)
         if item is None:
             return None
-        stamp, self.peeked = item
-        return int(stamp)
+        stamp, self.peeked = int(item[0]), item[1]
+        if stamp <= self.last_stamp:
+            raise OutputError(
+                f"{self.spec.name}: the stamps of a stream increase strictly from 0; {stamp} ns follows {self.last_stamp} ns"
+            )
+        self.last_stamp = stamp
+        return stamp
 
     def start(self, emit: Emit) -> Step:
         """Run on_start, at stamp 0."""

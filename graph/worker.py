@@ -18,7 +18,7 @@ import msgspec
 
 from graph.errors import UserError
 from graph.ledger import INFINITY, Mark, Step
-from graph.lockstep import GapError, Lockstep
+from graph.lockstep import EndlessError, GapError, Lockstep
 from graph.node import STREAM, Emission, Node, build_operator
 from graph.realtime import Realtime
 from graph.shard import Shard, schemas_of
@@ -79,7 +79,6 @@ class Worker:
         self.closing = False  # realtime: on_end shall run
         self.leaving = False
         self.stopping = False
-        self.promised = -1
         self.flowed = -1
         self.durations: list[int] = []
         self.skipped = 0
@@ -186,15 +185,12 @@ class Worker:
     def promise(self) -> None:
         """Tell the neighbours how far this operator is, if that has changed."""
         assert self.lockstep is not None
-        watermark = self.lockstep.watermark()
-        if watermark <= self.promised:
+        if (mark := self.lockstep.news(tuple(self.node.counts.values()))) is None:
             return
-        self.promised = watermark
-        mark = Mark(watermark, tuple(self.node.counts.values()), self.own_end)
         self.wire.tell(f"mark/{self.spec.name}", mark)
-        if watermark >= self.flowed + self.spec.ahead // FLOW_PARTS:
-            self.flowed = watermark
-            self.wire.put(f"flow/{self.spec.name}", b"", (0, 0, watermark))
+        if mark.watermark >= self.flowed + self.spec.ahead // FLOW_PARTS:
+            self.flowed = mark.watermark
+            self.wire.put(f"flow/{self.spec.name}", b"", (0, 0, mark.watermark))
 
     def after(self, step: Step) -> None:
         """Promise, then write what the call did into the shard."""
@@ -255,7 +251,6 @@ class Worker:
         step = node.start(self.emit)
         schedule.started = True
         if self.spec.kind == "source":
-            schedule.stream_stamp = 0
             self.demand.release()
         self.after(step)
         while not self.leaving:
@@ -271,13 +266,14 @@ class Worker:
                 if step.port == STREAM:
                     self.demand.release()
                 if step.ended is not None and self.spec.end == self.spec.name:
-                    self.own_end = arrival.time
                     schedule.finish_at(arrival.time)
                 self.after(step)
                 self.report()
                 continue
             if schedule.complete() and self.phase == "running":
                 break
+            if schedule.stranded():
+                raise EndlessError(self.spec.name)
             self.promise()
             self.report()
             waited = time.thread_time()
