@@ -66,7 +66,7 @@ class Planner(Operator):
     def on_obstacles(self, frame: PointCloud) -> None:
         self._frames.append(frame)
 
-    def on_pose(self, pose: Pose) -> Planner.Outputs:
+    def on_pose(self, pose: Pose) -> Outputs:
         self._poses.append((pose.measured_at, pose.world_from_base))
         while self._frames and self._frames[0].measured_at <= pose.measured_at:
             frame = self._frames.popleft()

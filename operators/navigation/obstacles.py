@@ -1,8 +1,9 @@
 """What stands in the way: cells above the floor that the lidar has hit, kept until it looks through them.
 
-Each column of the raster holds eleven voxels, 0.1 m high, from 0.1 to 1.2 m above the floor. A hit fills its voxel. A
-frame's rays, gathered in a panorama of nearest ranges, wear off each voxel that they pass through; after LIFE frames it
-is empty. Nothing is forgotten for not being seen: what enters the lidar's blind ring, or hides behind something, stays.
+Each column of the raster holds eleven voxels, 0.1 m high, from 0.1 to 1.2 m above the floor. A hit fills its voxel and
+leaves its height there. A frame's rays, gathered in a panorama of nearest ranges, wear off each voxel that they pass at
+that height (a table's edge is thinner than a voxel); after LIFE frames it is empty. Nothing is forgotten for not being
+seen: what enters the lidar's blind ring, or hides behind something, stays.
 """
 
 from __future__ import annotations
@@ -46,17 +47,14 @@ def panorama(points: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 
 
 @njit(cache=True)
-def _glance(
-    image: npt.NDArray[np.float32], x: float, y: float, z: float, half_height: float, margin: float
-) -> tuple[bool, bool, bool]:
-    """Look at a voxel in the lidar frame. Return: a ray passed through it, one ended in it, one ended before it."""
+def _glance(image: npt.NDArray[np.float32], x: float, y: float, z: float, margin: float) -> tuple[bool, bool, bool]:
+    """Look at a place in the lidar frame. Return: a ray passed through it, one ended there, one ended before it."""
     flat = math.sqrt(x * x + y * y)
     column = math.floor(math.atan2(y, x) * (AZIMUTHS / (2.0 * math.pi))) % AZIMUTHS
-    lower = math.floor((math.atan2(z - half_height, flat) - FIRST_ELEVATION) / ELEVATION_STEP)
-    upper = math.floor((math.atan2(z + half_height, flat) - FIRST_ELEVATION) / ELEVATION_STEP)
+    middle = math.floor((math.atan2(z, flat) - FIRST_ELEVATION) / ELEVATION_STEP)
     distance = math.sqrt(flat * flat + z * z)
     passed, ended, covered = False, False, False
-    for row in range(max(lower, 0), min(upper, ELEVATIONS - 1) + 1):
+    for row in range(max(middle - 1, 0), min(middle + 2, ELEVATIONS)):  # two of the three are as far apart as beams
         # The nearest of three columns: along a wall one ray hits it well behind a voxel, the next one well before.
         seen = min(image[row, column - 1], image[row, column], image[row, (column + 1) % AZIMUTHS])
         if seen < NOTHING:
@@ -81,6 +79,7 @@ def _moved(pose: npt.NDArray[np.float64], x: float, y: float, z: float) -> tuple
 @njit(cache=True)
 def wear(
     life: npt.NDArray[np.uint8],
+    height: npt.NDArray[np.uint8],
     filled: npt.NDArray[np.bool_],
     image: npt.NDArray[np.float32],
     lidar_from_world: npt.NDArray[np.float64],
@@ -100,9 +99,9 @@ def wear(
             for level in range(LEVELS):
                 if life[row, column, level] == 0:
                     continue
-                world_z = floor + LOWEST + (level + 0.5) * LEVEL
+                world_z = floor + LOWEST + (level + height[row, column, level] / 255.0) * LEVEL
                 x, y, z = _moved(lidar_from_world, world_x, world_y, world_z)
-                passed, ended, covered = _glance(image, x, y, z, 0.5 * LEVEL, margin)
+                passed, ended, covered = _glance(image, x, y, z, margin)
                 if passed and not ended:
                     life[row, column, level] -= 1
                     emptied = emptied or life[row, column, level] == 0
@@ -120,6 +119,7 @@ def wear(
 @njit(cache=True)
 def strike(
     life: npt.NDArray[np.uint8],
+    height: npt.NDArray[np.uint8],
     filled: npt.NDArray[np.bool_],
     points: npt.NDArray[np.float32],
     world_from_lidar: npt.NDArray[np.float64],
@@ -137,13 +137,16 @@ def strike(
         away = math.sqrt((world_x - pose[0, 3]) ** 2 + (world_y - pose[1, 3]) ** 2)
         if away > reach:
             continue
-        height = world_z - floor
-        if height < LOWEST + SLOPE * away or height >= HIGHEST:
+        above = world_z - floor
+        if above < LOWEST + SLOPE * away or above >= HIGHEST:
             continue
         row = math.floor((world_y - corner[1]) / resolution)
         column = math.floor((world_x - corner[0]) / resolution)
         if 0 <= row < rows and 0 <= column < columns:
-            life[row, column, min(int((height - LOWEST) / LEVEL), LEVELS - 1)] = LIFE
+            part = (above - LOWEST) / LEVEL
+            level = min(int(part), LEVELS - 1)
+            life[row, column, level] = LIFE
+            height[row, column, level] = int(255.0 * min(part - level, 1.0))
             filled[row, column] = True
 
 
@@ -169,8 +172,7 @@ def look(
         across, along = world_x - pose[0, 3], world_y - pose[1, 3]
         away = math.sqrt(across * across + along * along)
         sector = math.floor(math.atan2(along, across) * (SECTORS / (2.0 * math.pi))) % SECTORS
-        height = world_z - floor
-        if LOWEST + SLOPE * away <= height < HIGHEST:
+        if LOWEST + SLOPE * away <= world_z - floor < HIGHEST:
             nearest[sector] = min(nearest[sector], away)
         farthest[sector] = max(farthest[sector], away)
     rows, columns = seen.shape
@@ -187,7 +189,7 @@ def look(
 
 
 class ObstacleLayer:
-    """The columns that hold something, on a raster that grows with the world. 13 bytes a cell."""
+    """The columns that hold something, on a raster that grows with the world. 24 bytes a cell."""
 
     def __init__(self, lattice: Lattice, *, reach: float = 8.0) -> None:
         """Start empty. reach: metres around the lidar within which things are entered and removed."""
@@ -195,12 +197,14 @@ class ObstacleLayer:
         self.reach = reach
         shape = lattice.rows, lattice.columns
         self._life = np.zeros((*shape, LEVELS), np.uint8)
+        self._height = np.zeros((*shape, LEVELS), np.uint8)  # of the last hit, in 255ths of a level
         self.filled = np.zeros(shape, np.bool_)  # (rows, columns): something stands here
         self.seen = np.zeros(shape, np.bool_)  # (rows, columns): a ray has passed here
 
     def grow(self, lattice: Lattice) -> None:
         """Move onto a larger raster."""
         self._life = moved(self._life, self.lattice, lattice, 0)
+        self._height = moved(self._height, self.lattice, lattice, 0)
         self.filled = moved(self.filled, self.lattice, lattice, False)
         self.seen = moved(self.seen, self.lattice, lattice, False)
         self.lattice = lattice
@@ -219,7 +223,7 @@ class ObstacleLayer:
             max(column - cells, 0),
             min(column + cells + 1, self.lattice.columns),
         )
-        layers = self._life, self.filled
+        layers = self._life, self._height, self.filled
         place = self.lattice.origin, self.lattice.resolution
         wear(*layers, panorama(points), inverse(pose), floor, *place, box)
         strike(*layers, points, pose, floor, *place, self.reach)
@@ -233,5 +237,5 @@ class ObstacleLayer:
 
     def fill(self, rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64]) -> None:
         """Fill columns of the raster by their indices (n,), at the height of the lidar's level beams."""
-        self._life[rows, columns, LEVELS // 2] = LIFE
+        self._life[rows, columns, LEVELS // 2], self._height[rows, columns, LEVELS // 2] = LIFE, 0
         self.filled[rows, columns] = True
