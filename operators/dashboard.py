@@ -20,7 +20,7 @@ import numpy as np
 from graph.check import same_type
 from graph.contract import Operator, Ports, Sink, ports_of
 from graph.errors import UserError
-from graph.geometry import Matrix
+from graph.geometry import Matrix, transform
 from graph.graphfile import Edge, Graph, OperatorEntry
 from graph.ledger import Step
 from graph.loading import load_class
@@ -55,6 +55,7 @@ class Display:
         }
         self.stamp = 0
         self.carrier = (0, "")  # rank and name of what moves the robot: odometry, truth, an estimated pose
+        self.world_from_base: Matrix | None = None
         self.truth = Track()
         self.waiting: list[tuple[str, int, Pose]] = []  # name, stamp
         self.poses: dict[str, Colour] = {}
@@ -85,6 +86,9 @@ class Display:
 
     def _cloud(self, name: str, cloud: PointCloud) -> None:
         self.scene.cloud(name, cloud.points, cloud.base_from_lidar, label=cloud.label, truth=cloud.truth)
+        if self.world_from_base is not None and len(cloud.points) and self.news(name, "seen", True):
+            points = transform(self.world_from_base @ cloud.base_from_lidar, cloud.points)
+            self._cover(*np.percentile(points[:, :2], (5, 95), axis=0))
 
     def _odometry(self, name: str, odometry: Odometry) -> None:
         self.scene.number("plots/speed", name, odometry.linear)
@@ -144,7 +148,7 @@ class Display:
         """Move the robot, if nothing that knows better does. Returns whether it has."""
         if rank < self.carrier[0] or (rank == self.carrier[0] and name != self.carrier[1]):
             return False
-        self.carrier = (rank, name)
+        self.carrier, self.world_from_base = (rank, name), world_from_base
         self.scene.robot(world_from_base, valid=valid)
         self._cover(world_from_base[:2, 3] - 3.0, world_from_base[:2, 3] + 3.0)
         return True
@@ -285,8 +289,8 @@ class Dashboard(Sink):
         if port in ("pose", "drive") and message.measured_at in self.seen:
             age = 1e3 * (now - self.seen[message.measured_at])  # milliseconds of the wall clock, as seen from here
             self.display.scene.number("plots/latency", f"frame_to_{port}", age)
-        if not self.aimed and (eye := self.display.eye()) is not None:
-            self.aimed = True
+        if isinstance(message, PointCloud) and not self.aimed and (eye := self.display.eye()) is not None:
+            self.aimed = True  # once: from now on the camera is the user's
             self.stream.send_blueprint(robot_layout(eye=eye))
 
 

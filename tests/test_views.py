@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 from graph.cli import main
 from graph.geometry import planar, yaw
-from graph.graphfile import Clock, Edge, Graph, OperatorEntry
+from graph.graphfile import Clock, Edge, Graph, OperatorEntry, to_yaml
 from graph.inprocess import launch_in_process
 from tests.toy_robot import ERROR
 
@@ -367,6 +368,21 @@ def test_bad_input_is_one_sentence(
     error = capsys.readouterr().err
     assert sentence in error
     assert len(error.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("arguments", [["view", "toy.mcap"], ["launch", "toy.yaml", "--view"]])
+def test_a_missing_extra_is_named_with_the_command_to_install_it(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "toy.yaml").write_text(to_yaml(graph_of("toy", "tests.toy_robot:ToyRobot")))
+    monkeypatch.chdir(tmp_path)
+    for name in [name for name in sys.modules if name.startswith(("operators.views", "operators.dashboard"))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert main(arguments) == 2
+    assert (
+        'needs rerun, which is not installed; install it with: pip install "retracer[view]"' in capsys.readouterr().err
+    )
 
 
 def test_every_wants_a_whole_number(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -56,14 +56,18 @@ def robot_layout(*, eye: Eye | None = None, hidden: Sequence[str] = (), others: 
         name="robot",
     )
     if others:
-        side = rrb.Tabs(side, rrb.Vertical(*[_plot(plot, plot) for plot in others], name="other topics"), active_tab=0)
+        side = rrb.Tabs(
+            side,
+            rrb.Vertical(*[_plot(plot, plot.removeprefix("fields/")) for plot in others], name="other topics"),
+            active_tab=0,
+        )
     left = rrb.Vertical(world, legend, row_shares=[16, 1])
     return _blueprint(rrb.Horizontal(left, side, column_shares=[7, 3]))
 
 
 def numbers_layout(plots: Sequence[str]) -> rrb.Blueprint:
     """Lay out a recording without a robot: its plots, and the text log."""
-    curves = [_plot(plot, plot) for plot in plots]
+    curves = [_plot(plot, plot.removeprefix("fields/")) for plot in plots]
     views = [rrb.Grid(*curves)] if curves else []
     return _blueprint(rrb.Vertical(*views, _log(), row_shares=[*[4.0] * len(views), 1.0]))
 
