@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 
 from graph.codec import schema, type_name
-from graph.contract import Operator, Ports, Sink, Source, ports_of
+from graph.contract import Operator, Ports, Sink, Source, method_hints, ports_of
 from graph.durations import duration_text
 from graph.errors import UserError
 from graph.graphfile import TIMER, Draft, Edge, Graph, GraphError, Mistake
@@ -54,7 +54,7 @@ def optional_inputs(kind: type[Operator]) -> frozenset[str]:
     """Name the ports that need not be wired: those whose parameter is annotated `Message | None`."""
     found = set()
     for port in ports_of(kind).inputs:
-        hints = dict(typing.get_type_hints(getattr(kind, f"on_{port}")))
+        hints = method_hints(kind, f"on_{port}")
         hints.pop("return", None)
         if any(types.NoneType in typing.get_args(hint) for hint in hints.values()):
             found.add(port)

@@ -91,6 +91,11 @@ def ports_of(kind: type[Operator]) -> Ports:
     return _ports[kind]
 
 
+def method_hints(kind: type[Operator], method: str) -> dict[str, Any]:
+    """Read the annotations of a method; names of the class body, such as Outputs, count as known."""
+    return typing.get_type_hints(getattr(kind, method), localns=dict(vars(kind)))
+
+
 def _read_ports(kind: type[Operator]) -> Ports:
     name = kind.__qualname__
     inputs: dict[str, type[msgspec.Struct]] = {}
@@ -100,7 +105,7 @@ def _read_ports(kind: type[Operator]) -> Ports:
             if port == attribute or port in RESERVED or not inspect.isfunction(method):
                 continue
             try:
-                hints = typing.get_type_hints(getattr(kind, attribute))
+                hints = method_hints(kind, attribute)
             except NameError as error:
                 raise ContractError(f"{name}.{attribute}: {error}") from error
             parameters = list(inspect.signature(getattr(kind, attribute)).parameters)[1:]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 
@@ -12,6 +13,7 @@ os.dup2(_nowhere, 1)
 try:
     import pybullet
 finally:
+    ctypes.CDLL(None).fflush(None)  # the line waits in C's own buffer
     os.dup2(_kept, 1)
     os.close(_kept)
     os.close(_nowhere)
