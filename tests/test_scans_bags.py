@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import types
 
 import numpy as np
@@ -25,16 +26,22 @@ BASE_FROM_LIDAR = planar(0.1, -0.2, 0.3, 0.64)
 SECOND = 1_000_000_000
 
 
+@functools.cache
+def types_of(kind):
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+    if kind == "ros1":
+        listed = "geometry_msgs/TransformStamped[] transforms"
+        store.register(get_types_from_msg(listed, "tf2_msgs/msg/TFMessage"))
+    return store
+
+
 class Bag:
     """Writes a bag of one kind, message by message."""
 
     def __init__(self, folder, kind, name="drive"):
         self.kind = kind
         self.path = folder / (f"{name}.bag" if kind == "ros1" else name)
-        self.store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
-        if kind == "ros1":
-            listed = "geometry_msgs/TransformStamped[] transforms"
-            self.store.register(get_types_from_msg(listed, "tf2_msgs/msg/TFMessage"))
+        self.store = types_of(kind)
         plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
         self.writer = Writer1(self.path) if kind == "ros1" else Writer2(self.path, version=9, storage_plugin=plugin)
         self.connections = {}

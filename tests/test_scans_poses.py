@@ -40,7 +40,7 @@ def drive(count=50, *, linear=1.0, angular=0.3, period=100_000_000, start=1_305_
     return Trajectory(np.array(there), start + np.arange(count) * period)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(st.lists(st.tuples(st.integers(1, 10**10), poses), min_size=1, max_size=6), st.integers(0, 17 * 10**17))
 def test_tum_files_come_back_with_exact_stamps(tmp_path_factory, steps, start):
     path = tmp_path_factory.mktemp("tum") / "way.tum"
@@ -150,7 +150,7 @@ def test_the_calibration_places_the_lidar_in_the_camera(tmp_path):
         read_calibration(tmp_path / "calib.txt")
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.integers(0, 4_900_000_000))
 def test_a_pose_between_two_lies_between_them(after):
     way = drive()
