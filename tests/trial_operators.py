@@ -1,0 +1,112 @@
+"""Operators that put the runtime on trial: of many ports, sporadic, quitting, hoarding, waiting."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from graph import End, Operator, Sink, Source, Summary
+from graph.messages import PointCloud, Tick
+from tests.sample_operators import Blob, Count, CountOutputs
+
+MODULUS = 1_000_003
+
+
+class MixerOutputs(msgspec.Struct):
+    """Two numbers."""
+
+    x: Count | None = None
+    y: Count | None = None
+
+
+class MixerConfig(msgspec.Struct):
+    """What a Mixer does."""
+
+    seed: int = 0
+    share: int = 50  # per cent of the calls that say something
+    starts: bool = False  # says something in on_start
+    ends: bool = False  # says something in on_end
+    last: int | None = None  # number of the call that returns End
+    stamps: tuple[int, ...] = ()  # of a source's stream, nanoseconds
+
+
+class _Mixing:
+    """A state that depends on every call and on their order, and decides what is said."""
+
+    config: MixerConfig
+
+    def __init__(self) -> None:
+        self.state = self.config.seed + 1
+        self.calls = 0
+
+    def mix(self, number: int, value: int) -> Iterator[MixerOutputs | End]:
+        self.state = (self.state * 31 + number * 7 + value) % MODULUS
+        if self.state % 100 < self.config.share:
+            yield MixerOutputs(x=self._count())
+            if self.state % 3:
+                yield MixerOutputs(x=self._count() if self.state % 2 else None, y=self._count())
+        self.calls += 1
+        if self.calls == self.config.last:
+            yield End()
+
+    def _count(self) -> Count:
+        return Count(measured_at=self.calls, value=self.state)
+
+
+class Mixer(_Mixing, Operator):
+    """Mix numbers of up to four ports, and ticks of two timers, into one state; say it now and then."""
+
+    Config = MixerConfig
+    Outputs = MixerOutputs
+
+    def __init__(self, config: MixerConfig | None = None) -> None:
+        Operator.__init__(self, config)
+        _Mixing.__init__(self)
+
+    def on_start(self) -> Iterator[MixerOutputs | End] | None:
+        return self._once() if self.config.starts else None
+
+    def _once(self) -> Iterator[MixerOutputs]:
+        yield MixerOutputs(x=self._count(), y=self._count())
+
+    def on_slow(self, tick: Tick | None) -> Iterator[MixerOutputs | End]:
+        return self.mix(1, tick.measured_at)
+
+    def on_a(self, count: Count | None) -> Iterator[MixerOutputs | End]:
+        return self.mix(2, count.value)
+
+    def on_b(self, count: Count | None) -> Iterator[MixerOutputs | End]:
+        return self.mix(3, count.value)
+
+    def on_fast(self, tick: Tick | None) -> Iterator[MixerOutputs | End]:
+        return self.mix(4, tick.index)
+
+    def on_c(self, count: Count | None) -> Iterator[MixerOutputs | End]:
+        return self.mix(5, count.value)
+
+    def on_d(self, count: Count | None) -> Iterator[MixerOutputs | End]:
+        return self.mix(6, count.value)
+
+    def on_end(self) -> Iterator[MixerOutputs] | None:
+        return self._once() if self.config.ends else None
+
+
+class MixerSource(_Mixing, Source):
+    """Say mixed numbers at given stamps."""
+
+    Config = MixerConfig
+    Outputs = MixerOutputs
+
+    def __init__(self, config: MixerConfig | None = None) -> None:
+        Operator.__init__(self, config)
+        _Mixing.__init__(self)
+
+    def stream(self) -> Iterator[tuple[int, list[MixerOutputs | End]]]:
+        for stamp in self.config.stamps:
+            yield stamp, list(self.mix(0, stamp))
