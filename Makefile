@@ -1,7 +1,7 @@
 # Needs python3 (3.11 to 3.13), make and git; everything else goes into .venv.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
-EXTRAS := $(shell $(PYTHON) -c "import sys; print('sim,view,dev,bench' if sys.version_info < (3, 12) else 'view,dev,bench')")
+EXTRAS := $(shell $(PYTHON) -c "import sys; print('sim,view,ros,evo,dev,bench' if sys.version_info < (3, 12) else 'view,ros,evo,dev,bench')")
 RECORD ?=
 
 .PHONY: setup launch test test-all bench lint clean

@@ -17,6 +17,7 @@ from graph.errors import UserError
 # verb: (module with add_arguments and run, one line of help); a string, so that the runtime imports nobody
 DOMAIN = {
     "view": ("operators.views.view_command", "show a recording in Rerun"),
+    "import": ("operators.scans.import_command", "make a session of anyone's scans, captures and bags"),
     "building": ("sim.building_command", "draw and check a building"),
 }
 
