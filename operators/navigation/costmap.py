@@ -122,16 +122,26 @@ class Costmap:
         known = (self.cells >= 0) | self.obstacles.seen
         return weigh(distance, known, lethal, inflation, self.lattice.coarse(COARSE).cell(*robot))
 
+    def trust(self, x: float, y: float, radius: float) -> None:
+        """Take for free what nobody has seen within `radius` metres of a position."""
+        rows, columns = self._unseen(x, y, radius)
+        self.obstacles.seen[rows, columns] = True
+
     def distrust(self, x: float, y: float) -> None:
         """Take for occupied what nobody has seen around a position, as far as it may hide in the lidar's blind ring."""
+        self.obstacles.fill(*self._unseen(x, y, DOUBT_RADIUS))
+
+    def _unseen(self, x: float, y: float, radius: float) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Return rows and columns (n,) of the cells around a position that neither map nor lidar knows."""
         row, column = self.lattice.cell(x, y)
-        reach = math.ceil(DOUBT_RADIUS / CELL)
+        reach = math.ceil(radius / CELL)
         rows, columns = np.mgrid[row - reach : row + reach + 1, column - reach : column + reach + 1]
-        near = (rows - row) ** 2 + (columns - column) ** 2 <= reach * reach
+        near = (rows - row) ** 2 + (columns - column) ** 2 <= (radius / CELL) ** 2
         near &= (rows >= 0) & (rows < self.lattice.rows) & (columns >= 0) & (columns < self.lattice.columns)
         rows, columns = rows[near], columns[near]
         unknown = (self.cells[rows, columns] < 0) & ~self.obstacles.seen[rows, columns]
-        self.obstacles.fill(rows[unknown], columns[unknown])
+        unknown &= ~self.obstacles.filled[rows, columns]
+        return rows[unknown], columns[unknown]
 
     def window(self, x: float, y: float, side: float, limit: float) -> Surroundings:
         """Return how near things are, up to `limit` metres, in a square of `side` metres around a position.

@@ -29,7 +29,6 @@ ATTEMPTS = 8  # recoveries within FRESH metres after which a target is called un
 FRESH = 1.0  # metres
 REST = 200  # periods after which an unreachable target is tried again
 CAREFUL_SPEED = 0.4  # m/s at most, while the localizer is not sure
-BRAKE = 2.0  # times the usual acceleration, when every arc ends in something
 
 
 class Decision(NamedTuple):
@@ -87,6 +86,7 @@ class Navigator:
         self._field: Field | None = None
         self._field_lattice = Lattice(CELL * COARSE, 0, 0, 0, 0)
         self._path = np.empty((0, 2))
+        self._started = False
         self._until_replan = 0
         self._without_way = 0
         self._trail: deque[tuple[float, float, float]] = deque(maxlen=STILL_FOR)
@@ -122,6 +122,9 @@ class Navigator:
             return self._decide(measured_at, Twist(), measured, "wait")
         pose = self.commands.predict(measured_at, *measured)
         self.costmap.cover(pose[:2], self._goal)
+        if not self._started:  # whoever put the robot down left it room to turn
+            self._started = True
+            self.costmap.trust(pose[0], pose[1], self.footprint.circumscribed + 2.0 * self.window.padding)
         self.costmap.clear_footprint(self.footprint, measured)
         if math.dist(pose[:2], self._goal) < ARRIVED:
             self._trail.clear()
@@ -228,9 +231,8 @@ class Navigator:
         seconds_per_cost = self._field_lattice.resolution / (FREE * UNIT) / limits.speed
         way = way_around(self._field, self._field_lattice, pose[0], pose[1], self._side, seconds_per_cost)
         choice = self.window.choose(pose, now, around, way, top_speed=top_speed)
-        grip = limits.acceleration * STEP * (1.0 if math.isfinite(choice.seconds) else BRAKE)
         twist = Twist(
-            towards(now.linear, choice.target.linear, grip),
+            towards(now.linear, choice.target.linear, limits.acceleration * STEP),
             towards(now.angular, choice.target.angular, limits.turn_acceleration * STEP),
         )
         return self._decide(measured_at, twist, pose, "follow", choice.trajectory)

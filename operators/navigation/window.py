@@ -264,8 +264,9 @@ class DynamicWindow:
     def free_steps(self, pose: tuple[float, float, float], twist: Twist, around: Surroundings, steps: int) -> int:
         """Count the controller's periods for which a constant twist touches nothing, up to `steps`."""
         x, y, yaw = pose
+        needed = min(self.padding, room(around, self._body, COMFORT, x, y, yaw))
         for step in range(steps):
             x, y, yaw = advance(x, y, yaw, twist.linear, twist.angular, STEP)
-            if room(around, self._body, COMFORT, x, y, yaw) < self.padding:
+            if room(around, self._body, COMFORT, x, y, yaw) < needed:
                 return step
         return steps
