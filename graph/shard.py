@@ -5,11 +5,13 @@ Unchunked MCAP, flushed after each call, so that a killed process loses at most 
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable
 from pathlib import Path
 from typing import IO
 
 import msgspec
+from mcap.opcode import Opcode
 from mcap.writer import IndexType, Writer
 
 from graph.codec import schema, type_name
@@ -22,6 +24,9 @@ STEP, SUMMARY = "step", "summary"  # topics beside an operator's own ports: oper
 
 LEDGER_SCHEMA = "retracer.Step"
 SUMMARY_SCHEMA = "retracer.Summary"
+
+_RECORD = struct.Struct("<BQHIQQ")  # opcode, length of the rest; channel, sequence, log time, publish time
+_FIELDS = _RECORD.size - 9  # bytes of the rest before the data
 
 
 Schemas = dict[str, tuple[str, str]]
@@ -46,10 +51,11 @@ class Shard:
     def __init__(self, path: Path, spec: NodeSpec, schemas: Schemas, incarnation: int = 0) -> None:
         self.spec = spec
         self.stream: IO[bytes] = path.open("xb", buffering=1 << 20)
-        self.writer = Writer(self.stream, use_chunking=False, index_types=IndexType.NONE, enable_crcs=False)
+        self.writer = Writer(
+            self.stream, use_chunking=False, index_types=IndexType.NONE, enable_crcs=False, use_statistics=False
+        )
         self.writer.start(profile="retracer-shard", library="retracer")
         mine = {"operator": spec.name, "incarnation": str(incarnation)}
-        self.writer.add_metadata("retracer.shard", mine)
         self.channels: dict[str, int] = {}
         for port, (name, text) in schemas.items():
             number = self.writer.register_schema(name, "jsonschema", text.encode())
@@ -58,6 +64,7 @@ class Shard:
         self.channels[STEP] = self.writer.register_channel(f"{spec.name}/{STEP}", "msgpack", number, mine)
         number = self.writer.register_schema(SUMMARY_SCHEMA, "jsonschema", b'{"type": "object"}')
         self.channels[SUMMARY] = self.writer.register_channel(f"{spec.name}/{SUMMARY}", "msgpack", number, mine)
+        self.writer.add_metadata("retracer.shard", mine)  # the writer holds schemas and channels back until this
         self.stream.flush()
 
     def write(
@@ -66,20 +73,17 @@ class Shard:
         """Append the messages of one call, then its step; flushed when this returns."""
         for emission in emissions:
             if self.spec.record[emission.port] == "full":
-                self.writer.add_message(
-                    self.channels[emission.port],
-                    log_time=emission.stamp,
-                    publish_time=emission.stamp,
-                    sequence=emission.sequence,
-                    data=emission.payload,
-                )
+                self._add(emission.port, emission.stamp, emission.sequence, emission.payload)
         if summary is not None:
             self._add(SUMMARY, step.stamp, 0, msgspec.msgpack.encode(summary))
         self._add(STEP, step.stamp, step.index, msgspec.msgpack.encode(step))
         self.stream.flush()
 
     def _add(self, port: str, stamp: int, sequence: int, data: bytes) -> None:
-        self.writer.add_message(self.channels[port], log_time=stamp, publish_time=stamp, sequence=sequence, data=data)
+        # what Writer.add_message writes, without its two copies of the data
+        length = _FIELDS + len(data)
+        self.stream.write(_RECORD.pack(Opcode.MESSAGE, length, self.channels[port], sequence, stamp, stamp))
+        self.stream.write(data)
 
     def close(self) -> None:
         """Write the footer."""

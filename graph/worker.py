@@ -19,6 +19,7 @@ import msgspec
 from graph.errors import UserError
 from graph.ledger import INFINITY, Mark, Step
 from graph.lockstep import EndlessError, GapError, Lockstep
+from graph.memory import keep_pages, spare_garbage_collection
 from graph.node import STREAM, Emission, Node, build_operator
 from graph.realtime import Realtime
 from graph.shard import Shard, schemas_of
@@ -106,6 +107,7 @@ class Worker:
         wire.announce(f"state/{spec.name}")
         if spec.kind == "source":
             threading.Thread(target=self._pull, daemon=True).start()
+        spare_garbage_collection()
         wire.declare_ready(spec.name)
 
     # what comes in
@@ -356,6 +358,7 @@ def read_boot() -> Boot:
 def main() -> int:
     """Run one operator to its end. Exit code 0 only then; a traceback goes to stderr."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the launcher
+    keep_pages()
     boot = read_boot()
     _outlive_nobody()
     logging.basicConfig(level=boot.log_level.upper(), format="%(levelname)s %(name)s: %(message)s")
