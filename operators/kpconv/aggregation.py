@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 import torch
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, types
 from numba.extending import intrinsic
 
@@ -22,13 +22,13 @@ FEW = 512  # rows that are not worth a second thread
 
 
 @intrinsic
-def bits_of(typing_context: Any, value: Any) -> Any:  # noqa: ARG001
+def bits_of(typing_context: Any, value: Any) -> Any:
     """Reinterpret a float32 as uint32."""
     return types.uint32(types.float32), lambda context, builder, kind, args: builder.bitcast(args[0], ir.IntType(32))
 
 
 @intrinsic
-def float_of(typing_context: Any, value: Any) -> Any:  # noqa: ARG001
+def float_of(typing_context: Any, value: Any) -> Any:
     """Reinterpret a uint32 as float32."""
     return types.float32(types.uint32), lambda context, builder, kind, args: builder.bitcast(args[0], ir.FloatType())
 
@@ -84,7 +84,9 @@ def scatter(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def gather_largest(starts: Ints, neighbours: Ints, features: Floats, out: Floats, winners: Ints, begin: int, end: int) -> None:
+def gather_largest(
+    starts: Ints, neighbours: Ints, features: Floats, out: Floats, winners: Ints, begin: int, end: int
+) -> None:
     """Write the largest feature among each point's neighbours, and whose it is; zero where there is none."""
     for q in range(begin, end):
         for c in range(features.shape[1]):
@@ -217,7 +219,7 @@ def aggregate(features: torch.Tensor, matrix: Matrix, *, plain: bool = False) ->
     plain: by torch's own operations, as on devices other than the CPU.
     """
     if features.device.type == "cpu" and not plain:
-        return cast(torch.Tensor, _Aggregate.apply(features, matrix))
+        return cast(torch.Tensor, _Aggregate.apply(features, matrix))  # type: ignore[no-untyped-call]
     if not hasattr(matrix, "rows"):
         matrix.to_tensors()
     weighted = features[matrix.columns] * matrix.weights[:, None]
@@ -228,7 +230,7 @@ def aggregate(features: torch.Tensor, matrix: Matrix, *, plain: bool = False) ->
 def largest(features: torch.Tensor, matrix: Matrix, *, plain: bool = False) -> torch.Tensor:
     """Take the largest feature among each point's neighbours: (q, c), with gradients; zero where there is none."""
     if features.device.type == "cpu" and not plain:
-        return cast(torch.Tensor, _Largest.apply(features, matrix))
+        return cast(torch.Tensor, _Largest.apply(features, matrix))  # type: ignore[no-untyped-call]
     if not hasattr(matrix, "rows"):
         matrix.to_tensors()
     owners = matrix.owners[:, None].expand(-1, features.shape[1])

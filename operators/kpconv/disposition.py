@@ -59,7 +59,7 @@ def kernel_points(count: int) -> Doubles:
 
 
 def upright(points: Doubles) -> Doubles:
-    """Turn points so that the axis of the most unlike moment of inertia is z, and the farthest point from it has y = 0."""
+    """Turn points so that the axis of the odd moment of inertia is z, and the farthest point from it has y = 0."""
     moments, axes = np.linalg.eigh(points.T @ points)
     odd = 0 if moments[1] - moments[0] > moments[2] - moments[1] else 2
     turned = points @ np.roll(axes, 2 - odd, axis=1)

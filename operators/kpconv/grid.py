@@ -68,7 +68,7 @@ def collect(points: Floats, size: float) -> tuple[Longs, Ints, Longs, Longs, Int
         if not (abs(u) < farthest and abs(v) < farthest and abs(w) < farthest):
             voxel_of[n] = NONE
             continue
-        i, j, k = int(math.floor(u)), int(math.floor(v)), int(math.floor(w))
+        i, j, k = math.floor(u), math.floor(v), math.floor(w)
         ci, cj, ck = i // CELL, j // CELL, k // CELL
         local = ((i - ci * CELL) * CELL + (j - cj * CELL)) * CELL + (k - ck * CELL)
         key = (cell_key(ci, cj, ck) << LOCAL) | local
@@ -84,9 +84,9 @@ def collect(points: Floats, size: float) -> tuple[Longs, Ints, Longs, Longs, Int
                 places[found, 0], places[found, 1], places[found, 2] = i, j, k
                 found += 1
             number = int(numbers[slot])
-        sums[number, 0] += int(math.floor((u - i) * FINE))
-        sums[number, 1] += int(math.floor((v - j) * FINE))
-        sums[number, 2] += int(math.floor((w - k) * FINE))
+        sums[number, 0] += math.floor((u - i) * FINE)
+        sums[number, 1] += math.floor((v - j) * FINE)
+        sums[number, 2] += math.floor((w - k) * FINE)
         sizes[number] += 1
         voxel_of[n] = number
     return keys[:found], places[:found], sums[:found], sizes[:found], voxel_of
@@ -164,9 +164,9 @@ def fill_nearest(grid: Grid, queries: Floats, rows: Ints, begin: int, end: int) 
         best = dx * dx + dy * dy + dz * dz
         reach = math.sqrt(best)
         # cells that the sphere through the near point touches; mostly one
-        for i in range(int(math.floor((x - reach) / size)), int(math.floor((x + reach) / size)) + 1):
-            for j in range(int(math.floor((y - reach) / size)), int(math.floor((y + reach) / size)) + 1):
-                for k in range(int(math.floor((z - reach) / size)), int(math.floor((z + reach) / size)) + 1):
+        for i in range(math.floor((x - reach) / size), math.floor((x + reach) / size) + 1):
+            for j in range(math.floor((y - reach) / size), math.floor((y + reach) / size) + 1):
+                for k in range(math.floor((z - reach) / size), math.floor((z + reach) / size) + 1):
                     first, after = bounds_of(grid, i, j, k)
                     for p in range(first, after):
                         dx, dy, dz = cloud[p, 0] - x, cloud[p, 1] - y, cloud[p, 2] - z

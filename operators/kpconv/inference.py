@@ -39,9 +39,10 @@ class Bottleneck(NamedTuple):
 
 def best_precision() -> torch.dtype:
     """Return bfloat16 where the CPU multiplies it natively, else float32."""
-    native = getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)() or getattr(
-        torch.cpu, "_is_amx_tile_supported", lambda: False
-    )()
+    native = (
+        getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)()
+        or getattr(torch.cpu, "_is_amx_tile_supported", lambda: False)()
+    )
     return torch.bfloat16 if native else torch.float32
 
 
@@ -147,7 +148,7 @@ class FastKPFCNN:
             features = self.residual(f"level {level + 1}", block, features, links, strided=False)
             skips.append(features)
         for level, decoder in zip(reversed(range(len(self.decoders))), self.decoders, strict=True):
-            # a linear layer on [upsampled, skip] is the sum of two, and that of the upsampled may come before upsampling
+            # a linear layer on [upsampled, skip] is a sum of two, and the first may come before upsampling
             above, skip = features.shape[1], skips[level]
             coarse = self.room("coarse", len(features), decoder.weight.shape[1])
             torch.addmm(decoder.bias, features, decoder.weight[:above], out=coarse)

@@ -93,7 +93,7 @@ def connect(
     pairs = neighbour_starts[begin] if listed else 0
     for q in range(begin, len(queries)):
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
-        i, j, k = int(math.floor(x / size)), int(math.floor(y / size)), int(math.floor(z / size))
+        i, j, k = math.floor(x / size), math.floor(y / size), math.floor(z / size)
         if not known or i != last_i or j != last_j or k != last_k:
             known, last_i, last_j, last_k, cells = True, i, j, k, 0
             for code in range(27):

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from operators.kpconv.aggregation import Matrix, aggregate, largest
+from operators.kpconv.grid import Floats
 from operators.kpconv.pyramid import Geometry, Pyramid
+from operators.kpconv.settings import CLASSES
 
-CLASSES = ("ground", "permanent", "longT", "shortT")  # labels 1 to 4; 0 is uncertain and never predicted
 SLOPE = 0.1  # of the leaky rectifiers
 MOMENTUM = 0.02  # of the batch norms' running statistics
 
@@ -26,7 +25,7 @@ class Batch(NamedTuple):
     parents: tuple[Tensor, ...]
 
 
-def batch_of(pyramid: Pyramid, features: np.ndarray, device: torch.device | str = "cpu", kernel_points: int = 15) -> Batch:
+def batch_of(pyramid: Pyramid, features: Floats, device: torch.device | str = "cpu", kernel_points: int = 15) -> Batch:
     """Put a pyramid on a device."""
     device = torch.device(device)
     return Batch(
@@ -80,7 +79,7 @@ class Simple(nn.Module):
 
 
 class Residual(nn.Module):
-    """A bottleneck: narrow to a quarter, convolve, widen, add the shortcut; strided where the matrix leads to fewer points."""
+    """A bottleneck: narrow to a quarter, convolve (strided: to fewer points), widen, add the shortcut."""
 
     def __init__(self, inputs: int, outputs: int, kernel_points: int, *, strided: bool) -> None:
         super().__init__()
@@ -103,7 +102,7 @@ class Residual(nn.Module):
 class KPFCNN(nn.Module):
     """Classify the points of a pyramid: simple; 4 x (strided residual, residual); 4 x (upsample, unary); head.
 
-    width: channels of the decoder's last layer, 128 in the paper (16.3 M parameters), of which all others are multiples.
+    width: channels of the decoder's last layer, 128 in the paper (16.3 M parameters); all others follow.
     """
 
     def __init__(self, inputs: int, width: int, geometry: Geometry, classes: int = len(CLASSES)) -> None:
@@ -149,6 +148,3 @@ def folded(weight: Tensor, norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
 def parameters_of(network: nn.Module) -> int:
     """Count the trained numbers of a network."""
     return sum(parameter.numel() for parameter in network.parameters())
-
-
-__all__: Sequence[str] = ["CLASSES", "KPFCNN", "Batch", "KPConv", "batch_of", "folded", "parameters_of"]
