@@ -56,11 +56,13 @@ class Display:
         self.stamp = 0
         self.carrier = (0, "")  # rank and name of what moves the robot: odometry, truth, an estimated pose
         self.world_from_base: Matrix | None = None
+        self.scans: dict[str, PointCloud] = {}  # that wait to be drawn
         self.truth = Track()
         self.waiting: list[tuple[str, int, Pose]] = []  # name, stamp
         self.poses: dict[str, Colour] = {}
         self.said: dict[tuple[str, str], Any] = {}
         self.busy: dict[str, tuple[int, int]] = {}  # operator: stamp, nanoseconds
+        self.latencies: list[float] = []  # milliseconds
         self.floor: tuple[Any, Any] | None = None  # corners (2,) of the rectangle on which things have been drawn
 
     def show(self, name: str, message: msgspec.Struct, stamp: int) -> None:
@@ -69,6 +71,12 @@ class Display:
         self.scene.at(stamp)
         self.ways[type(message)](name, message)
 
+    def finish(self) -> None:
+        """Draw what still waits."""
+        for name, cloud in self.scans.items():
+            self._draw(name, cloud)
+        self.scans.clear()
+
     def step(self, operator: str, step: Step) -> None:
         """Plot how long an operator's calls of one stamp took together."""
         stamp, spent = self.busy.get(operator, (step.stamp, 0))
@@ -76,6 +84,7 @@ class Display:
             self.scene.at(stamp)
             if spent:
                 self.scene.number("plots/latency", operator, spent / 1e6)
+                self.latencies.append(spent / 1e6)
             spent = 0
         own = 0 if step.port in ("start", "end") else step.wall_duration
         self.busy[operator] = (step.stamp, spent + own)
@@ -85,22 +94,30 @@ class Display:
         return None if self.floor is None else eye_over(*self.floor)
 
     def _cloud(self, name: str, cloud: PointCloud) -> None:
-        self.scene.cloud(name, cloud.points, cloud.base_from_lidar, label=cloud.label, truth=cloud.truth)
-        if self.world_from_base is not None and len(cloud.points) and self.news(name, "seen", True):
-            points = transform(self.world_from_base @ cloud.base_from_lidar, cloud.points)
+        """Keep a scan until it is known where it was taken; a second one waits for nothing."""
+        if (older := self.scans.pop(name, None)) is not None:
+            self._draw(name, older)
+        self.scans[name] = cloud
+
+    def _draw(self, name: str, cloud: PointCloud) -> None:
+        world_from_base = np.eye(4) if self.world_from_base is None else self.world_from_base
+        world_from_sensor = world_from_base @ cloud.base_from_lidar
+        self.scene.cloud(name, cloud.points, world_from_sensor, label=cloud.label, truth=cloud.truth)
+        if len(cloud.points) and self.news(name, "seen", True):
+            points = transform(world_from_sensor, cloud.points)
             self._cover(*np.percentile(points[:, :2], (5, 95), axis=0))
 
     def _odometry(self, name: str, odometry: Odometry) -> None:
         self.scene.number("plots/speed", name, odometry.linear)
         true = odometry.true_world_from_base
-        self._move(1, name, odometry.odom_from_base if true is None else true)
+        self._move(1, name, odometry.measured_at, odometry.odom_from_base if true is None else true)
         if true is not None:
             self._known(odometry.measured_at, true)
 
     def _pose(self, name: str, pose: Pose) -> None:
         number = len(self.poses)
         colour = self.poses.setdefault(name, OTHERS[(number - 1) % len(OTHERS)] if number else ESTIMATE)
-        if not self._move(3, name, pose.world_from_base, valid=pose.valid):
+        if not self._move(3, name, pose.measured_at, pose.world_from_base, valid=pose.valid):
             self.scene.ghost(name, pose.world_from_base, colour)
         self.scene.trail(name, pose.world_from_base, colour)
         if self.news(name, "valid", pose.valid, usual=True):
@@ -110,7 +127,7 @@ class Display:
         self._judge()
 
     def _truth(self, name: str, truth: Truth) -> None:
-        self._move(2, name, truth.world_from_base)
+        self._move(2, name, truth.measured_at, truth.world_from_base)
         self.scene.ghost(name, truth.world_from_base, TRUE_POSE)
         self.scene.trail(name, truth.world_from_base, TRUE_POSE, height=0.03)
         self.scene.people(name, truth.people, truth.people_moving)
@@ -144,13 +161,15 @@ class Display:
     def _text(self, name: str, text: Text) -> None:
         self.scene.say(name, text.text, LEVELS.get(text.level, "INFO"))
 
-    def _move(self, rank: int, name: str, world_from_base: Matrix, *, valid: bool = True) -> bool:
-        """Move the robot, if nothing that knows better does. Returns whether it has."""
+    def _move(self, rank: int, name: str, measured_at: int, world_from_base: Matrix, *, valid: bool = True) -> bool:
+        """Move the robot, and draw the scans taken there, if nothing that knows better does. Returns whether it has."""
         if rank < self.carrier[0] or (rank == self.carrier[0] and name != self.carrier[1]):
             return False
         self.carrier, self.world_from_base = (rank, name), world_from_base
         self.scene.robot(world_from_base, valid=valid)
         self._cover(world_from_base[:2, 3] - 3.0, world_from_base[:2, 3] + 3.0)
+        for scan in [scan for scan, cloud in self.scans.items() if cloud.measured_at <= measured_at]:
+            self._draw(scan, self.scans.pop(scan))
         return True
 
     def _known(self, measured_at: int, world_from_base: Matrix) -> None:
@@ -269,6 +288,7 @@ class Dashboard(Sink):
     def on_end(self) -> None:
         """Send what is still on its way; a web page goes with the run, a window stays."""
         if self.display is not None:
+            self.display.finish()
             try:
                 finish(self.stream, patience=3.0)
             except ViewerError as error:

@@ -91,7 +91,7 @@ def test_a_dashboard_shows_what_it_is_given(tmp_path: Path) -> None:
                 getattr(dashboard, f"on_{port}")(getattr(outputs, port, None))
     dashboard.on_frame(None)
     dashboard.on_end()
-    assert len(rows(file, "world/robot/frame")) == 3
+    assert len(rows(file, "world/frame")) == 3
     curve = [row for row in rows(file, "plots/localization_error/pose") if row.get("Scalars:scalars")]
     assert [row["Scalars:scalars"][0] for row in curve] == pytest.approx([3.0] * 3)
     ages = [
@@ -109,7 +109,7 @@ def test_clouds_come_no_faster_than_asked(tmp_path: Path) -> None:
         for outputs in ToyRobot().on_tick(Tick(measured_at=index, index=index)):
             dashboard.on_frame(getattr(outputs, "frame", None))
     dashboard.on_end()
-    assert len(rows(file, "world/robot/frame")) == 1
+    assert len(rows(file, "world/frame")) == 1
 
 
 def test_a_run_with_a_dashboard_is_complete_and_says_the_same(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_a_run_with_a_dashboard_is_complete_and_says_the_same(tmp_path: Path) ->
     assert verdict.verdict == "COMPLETE", verdict.reasons
     seen, alone = (list(Recording(tmp_path / f"{name}.mcap").messages()) for name in ("seen", "alone"))
     assert seen == alone
-    assert {"world/robot/frame", "world/robot", "world/map/0"} <= entities(tmp_path / "live.rrd")
+    assert {"world/frame", "world/robot", "world/map/0"} <= entities(tmp_path / "live.rrd")
 
 
 def test_a_viewer_that_is_gone_does_not_stop_the_dashboard(capsys: pytest.CaptureFixture[str]) -> None:

@@ -201,7 +201,7 @@ def scene_of(file: Path) -> Scene:
     return Scene(stream)
 
 
-def test_a_cloud_lies_on_the_robot_by_the_pose_of_its_sensor(tmp_path: Path) -> None:
+def test_a_cloud_lies_where_its_sensor_was(tmp_path: Path) -> None:
     scene = scene_of(tmp_path / "scene.rrd")
     points = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], np.float32)
     scene.at(1_500_000_000)
@@ -209,14 +209,14 @@ def test_a_cloud_lies_on_the_robot_by_the_pose_of_its_sensor(tmp_path: Path) -> 
     scene.cloud("by_label", points, np.eye(4), label=np.array([4, 1], np.uint8), truth=np.array([6, 2], np.uint8))
     scene.cloud("by_height", points, planar(0.0, 0.0, 0.0, z=-3.0))
     finish(scene.stream, patience=10.0)
-    (row,) = rows(tmp_path / "scene.rrd", "world/robot/by_truth")
+    (row,) = rows(tmp_path / "scene.rrd", "world/by_truth")
     assert row["seconds"] == 1.5
     assert row["Points3D:positions"] == points.tolist()
     assert row["Points3D:class_ids"] == [6, 2]
     np.testing.assert_allclose(row["Transform3D:translation"], [[0.1, 0.2, 0.64]], rtol=1e-6)
-    (row,) = rows(tmp_path / "scene.rrd", "world/robot/by_label")
+    (row,) = rows(tmp_path / "scene.rrd", "world/by_label")
     assert row["Points3D:class_ids"] == [palette.FIRST_LABEL + 4, palette.FIRST_LABEL + 1]
-    (row,) = rows(tmp_path / "scene.rrd", "world/robot/by_height")
+    (row,) = rows(tmp_path / "scene.rrd", "world/by_height")
     low, high = ([colour >> shift & 255 for shift in (24, 16, 8)] for colour in row["Points3D:colors"])
     assert [low, high] == palette.height_colours(np.array([0.0, 3.0])).tolist()
 
@@ -275,7 +275,7 @@ def test_a_recording_becomes_a_view(view: Path) -> None:
     drawn = entities(view)
     for entity in (
         "world/robot",
-        "world/robot/toy/frame",
+        "world/toy/frame",
         "world/toy/truth/trail",
         "world/toy/truth/people",
         "world/toy/pose/trail",
@@ -290,7 +290,7 @@ def test_a_recording_becomes_a_view(view: Path) -> None:
         "log/toy/text",
     ):
         assert entity in drawn
-    assert len(rows(view, "world/robot/toy/frame")) == TICKS
+    assert len(rows(view, "world/toy/frame")) == TICKS
 
 
 def test_the_localization_error_is_plotted_at_each_pose(view: Path) -> None:
@@ -323,7 +323,7 @@ def test_what_happens_is_told_once(view: Path) -> None:
 def test_every_shows_each_so_many_th_cloud(folder: Path) -> None:
     file = folder / "thin.rrd"
     assert main(["view", str(folder / "toy.mcap"), "--every", "5", "--save", str(file)]) == 0
-    assert [row["seconds"] for row in rows(file, "world/robot/toy/frame")] == pytest.approx([0.0, 0.5, 1.0])
+    assert [row["seconds"] for row in rows(file, "world/toy/frame")] == pytest.approx([0.0, 0.5, 1.0])
     assert len(rows(file, "world/robot")) >= TICKS
 
 

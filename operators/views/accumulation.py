@@ -27,7 +27,7 @@ class LayeredCloud:
     voxel: metres; of the points of one voxel the first is kept.
     """
 
-    def __init__(self, voxel: float = 0.05) -> None:
+    def __init__(self, voxel: float = 0.08) -> None:
         self.voxel = voxel
         self._seen: set[int] = set()
         self._layers: list[Layer | None] = []

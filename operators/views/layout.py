@@ -26,15 +26,21 @@ def eye_over(corner: npt.ArrayLike, opposite: npt.ArrayLike) -> Eye:
     low, high = np.minimum(corner, opposite), np.maximum(corner, opposite)
     x, y = (low + high) / 2
     width, depth = np.maximum(high - low, 4.0)
-    reach = max(0.62 * width, 0.95 * depth)
-    return Eye((float(x), float(y - 0.75 * reach), float(1.1 * reach)), (float(x), float(y - 0.04 * depth), 0.0))
+    reach = max(0.68 * width, 0.8 * depth)
+    return Eye((float(x), float(y - 0.5 * reach), float(1.25 * reach)), (float(x), float(y - 0.02 * depth), 0.0))
 
 
-def robot_layout(*, eye: Eye | None = None, hidden: Sequence[str] = (), others: Sequence[str] = ()) -> rrb.Blueprint:
+def robot_layout(
+    *,
+    eye: Eye | None = None,
+    hidden: Sequence[str] = (),
+    others: Sequence[str] = (),
+    slowest: float | None = None,
+) -> rrb.Blueprint:
     """Lay out a robot's run: the world, plots of localization error, latency and speed, the text log.
 
     eye: None leaves it to the viewer. hidden: entities of the world that are not shown at first. others: further plots,
-    in a tab of their own.
+    in a tab of their own. slowest: milliseconds up to which latencies are shown; None shows even the first, cold call.
     """
     controls = rrb.EyeControls3D(position=eye.position, look_target=eye.target) if eye else None
     world = rrb.Spatial3DView(
@@ -49,7 +55,7 @@ def robot_layout(*, eye: Eye | None = None, hidden: Sequence[str] = (), others: 
     legend = rrb.Spatial2DView(origin="legend", visual_bounds=bounds, background=BACKGROUND, titlebar=False)
     side = rrb.Vertical(
         _plot("plots/localization_error", "localization error (cm)"),
-        _plot("plots/latency", "latency (ms)"),
+        _plot("plots/latency", "latency (ms)", up_to=slowest),
         _plot("plots/speed", "speed (m/s)"),
         _log(),
         row_shares=[4, 4, 4, 3],
@@ -72,9 +78,10 @@ def numbers_layout(plots: Sequence[str]) -> rrb.Blueprint:
     return _blueprint(rrb.Vertical(*views, _log(), row_shares=[*[4.0] * len(views), 1.0]))
 
 
-def _plot(origin: str, name: str) -> rrb.TimeSeriesView:
-    legend, axis = rrb.PlotLegend(corner="lefttop"), rrb.TimeAxis(link="linktoglobal")
-    return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=legend, axis_x=axis)
+def _plot(origin: str, name: str, *, up_to: float | None = None) -> rrb.TimeSeriesView:
+    legend, time = rrb.PlotLegend(corner="lefttop"), rrb.TimeAxis(link="linktoglobal")
+    values = None if up_to is None else rrb.ScalarAxis(range=(0.0, up_to))
+    return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=legend, axis_x=time, axis_y=values)
 
 
 def _log() -> rrb.TextLogView:

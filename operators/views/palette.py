@@ -20,8 +20,8 @@ class Class(NamedTuple):
 
 TRUTH = (
     Class("unknown", (128, 128, 128)),
-    Class("ground", (104, 92, 78)),
-    Class("wall", (126, 156, 190)),
+    Class("ground", (128, 106, 82)),
+    Class("wall", (150, 200, 255)),
     Class("door", (188, 120, 52)),
     Class("table", (76, 190, 96)),
     Class("chair", (58, 130, 255)),
@@ -30,8 +30,8 @@ TRUTH = (
 )
 LABELS = (
     Class("uncertain", (128, 128, 128)),
-    Class("ground", (104, 92, 78)),
-    Class("permanent", (126, 156, 190)),
+    Class("ground", (128, 106, 82)),
+    Class("permanent", (150, 200, 255)),
     Class("long-term movable", (76, 190, 96)),
     Class("short-term movable", (255, 64, 64)),
 )
@@ -53,9 +53,9 @@ THINGS = (
 )
 
 _HEIGHTS = np.array([0.02, 0.15, 1.0, 2.5])  # metres above the floor
-_TINTS = np.array([(50, 54, 64), (62, 72, 92), (92, 112, 150), (158, 182, 214)], np.float64)
+_TINTS = np.array([(40, 44, 54), (48, 58, 76), (64, 82, 114), (100, 122, 160)], np.float64)
 _DOUBTS = np.array([0.0, 0.4, 0.7, 1.0])  # movable probability: permanent, uncertain, long-term, short-term
-_DOUBT_TINTS = np.array([(92, 112, 150), (128, 128, 128), (76, 190, 96), (255, 64, 64)], np.float64)
+_DOUBT_TINTS = np.array([(64, 82, 114), (128, 128, 128), (76, 190, 96), (255, 64, 64)], np.float64)
 _FREE, _OCCUPIED = np.array((38, 48, 60), np.float64), np.array((255, 138, 60), np.float64)
 
 

@@ -1,7 +1,7 @@
 """The scene: everything of a robot that can be drawn, as entities of one Rerun stream.
 
-world/robot            the robot where it believes to be, with its body and, below it, its point clouds
-world/<name>           maps, grids, plans, people, trails, other poses
+world/robot            the robot where it believes to be
+world/<name>           scans, maps, grids, plans, people, trails, other poses
 plots/<quantity>/...   numbers over time
 log/<name>             lines of text
 """
@@ -23,7 +23,7 @@ TIMELINE = "stamp"
 BODY = (0.42, 0.31, 0.30)  # metres: length, width, height of the drawn robot
 PERSON_HEIGHT, PERSON_RADIUS = 1.75, 0.25  # metres
 
-_POINT, _MAP_POINT, _LINE, _THIN = (rr.Radius.ui_points(size) for size in (1.6, 1.1, 2.2, 1.2))
+_POINT, _MAP_POINT, _LINE, _THIN = (rr.Radius.ui_points(size) for size in (1.8, 1.0, 2.4, 1.0))
 
 Points = npt.NDArray[Any]
 
@@ -47,15 +47,15 @@ class Scene:
         """Set the time, in nanoseconds, of what is drawn next."""
         self.stream.set_time(TIMELINE, duration=np.timedelta64(stamp, "ns"))
 
-    # the robot and its sensors
+    # the robot and its senses
 
     def robot(self, world_from_base: Matrix, *, valid: bool = True) -> None:
-        """Put the robot, with what hangs on it, at a pose (4, 4); red where the pose is not valid."""
+        """Put the robot at a pose (4, 4); red where the pose is not valid."""
         if "robot" not in self._named:
             self._named.add("robot")
             length, _, height = BODY
             nose = rr.Arrows3D(
-                origins=(0, 0, height), vectors=(1.2 * length, 0, 0), radii=0.035, colors=palette.ESTIMATE
+                origins=(0, 0, height), vectors=(2.0 * length, 0, 0), radii=0.06, colors=palette.ESTIMATE
             )
             self.stream.log("world/robot/heading", nose, static=True)
         colour = palette.ESTIMATE if valid else palette.TRUTH[6].colour
@@ -67,12 +67,12 @@ class Scene:
         self,
         name: str,
         points: Points,
-        base_from_sensor: Matrix,
+        world_from_sensor: Matrix,
         *,
         label: Points | None = None,
         truth: Points | None = None,
     ) -> None:
-        """Draw points (n, 3) of a sensor on the robot, coloured by label, else by true class, else by height."""
+        """Draw a scan (n, 3) where its sensor was (4, 4), coloured by label, else by true class, else by height."""
         options: dict[str, Any] = {}
         if label is not None:
             self._legend(palette.LABELS)
@@ -80,10 +80,9 @@ class Scene:
         elif truth is not None:
             options["class_ids"] = truth.astype(np.uint16)
         else:
-            heights = points @ base_from_sensor[2, :3].astype(points.dtype) + points.dtype.type(base_from_sensor[2, 3])
-            options["colors"] = palette.height_colours(heights)
+            options["colors"] = palette.height_colours(points @ world_from_sensor[2, :3] + world_from_sensor[2, 3])
         cloud = rr.Points3D(points, radii=_POINT, point_shading="flat", **options)
-        self.stream.log(f"world/robot/{name}", _transform(base_from_sensor), cloud)
+        self.stream.log(f"world/{name}", _transform(world_from_sensor), cloud)
 
     def ghost(self, name: str, world_from_base: Matrix, colour: Colour) -> None:
         """Draw the outline of the robot at a pose (4, 4): the true one, or another localizer's."""
@@ -149,6 +148,7 @@ class Scene:
             data=image.tobytes(),
             format=rr.components.ImageFormat(width, height, channel_datatype="U8", color_model="RGBA"),
             cell_size=resolution,
+            opacity=0.99,  # of an opaque image even transparent cells would be drawn, in black
             translation=(*corner, -0.02),  # below the floor's points, so that neither flickers
         )
         self.stream.log(f"world/{name}", drawn)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
@@ -26,7 +27,7 @@ from operators.views.layout import numbers_layout, robot_layout
 from operators.views.scene import Scene
 from operators.views.viewer import Viewer, ViewerError, finish, has_display, open_stream, send_to
 
-CLOUDS, GRIDS = 600, 60  # how many of a topic are shown by default, evenly spread: a viewer keeps all in memory
+CLOUDS, GRIDS = 300, 60  # how many of a topic are shown by default, evenly spread: a viewer keeps all in memory
 CLOUD, GRID = "graph.messages.PointCloud", "graph.messages.OccupancyGrid"
 
 
@@ -91,8 +92,9 @@ def draw(
     def layout() -> rrb.Blueprint:
         if not shown:
             return numbers_layout(list(plots))
-        hidden = [f"world/robot/{topic}" for topic in clouds if topic != best]
-        return robot_layout(eye=display.eye(), hidden=hidden, others=list(plots))
+        hidden = [f"world/{topic}" for topic in clouds if topic != best]
+        usual = float(np.percentile(display.latencies, 99)) if display.latencies else 0.0
+        return robot_layout(eye=display.eye(), hidden=hidden, others=list(plots), slowest=1.5 * usual or None)
 
     if shown:
         stream.send_blueprint(layout())
@@ -110,6 +112,7 @@ def draw(
             _show(display, entry, kind)
         elif _numbers(display, entry, recording.types[entry.topic][0]):
             plots[f"fields/{entry.topic}"] = None
+    display.finish()
     display.scene.at(recording.verdict.end)
     reasons = "".join(f"; {reason}" for reason in recording.verdict.reasons)
     display.scene.say("verdict", recording.verdict.verdict + reasons, "WARN" if reasons else "INFO")
