@@ -1,27 +1,23 @@
-"""A building as data: walls, doors, pillars, rooms, table positions and tours, read from a YAML file.
+"""A building as data: walls, doors, pillars, rooms, table positions and tours.
 
-Lengths in metres, angles in degrees in the file. Walls, rooms and doors are given by the centre lines of the walls.
+Lengths in metres, angles in degrees. Walls, rooms and doors are given by the centre lines of the walls.
 """
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
-import yaml
 
-from sim.solids import Body, Box, Truth
+from sim.solids import Box
 
 Point = tuple[float, float]
 Pose2 = tuple[float, float, float]  # x, y in metres, heading in degrees
 
-SHIPPED = Path(__file__).parent / "buildings"
 LEAF_THICKNESS = 0.04  # metres
-ON_WALL = 0.01  # metres: a door this near to a wall's centre line belongs to the wall
 
 
 class BuildingError(ValueError):
@@ -29,10 +25,28 @@ class BuildingError(ValueError):
 
 
 class WallStyle(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Measures of every wall of the building."""
+    """Measures of every wall that has none of its own."""
 
     thickness: float = 0.15
     height: float = 2.5
+
+
+class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A wall with measures of its own; one without is written as the bare line."""
+
+    line: list[Point]
+    thickness: float | None = None
+    height: float | None = None
+
+
+class Segment(NamedTuple):
+    """One straight piece of a wall, along its centre line."""
+
+    wall: int  # index of the wall in the file
+    start: Point
+    end: Point
+    thickness: float
+    height: float
 
 
 class Door(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -51,10 +65,10 @@ class Door(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         turn = math.radians(self.heading)
         return self.hinge[0] + self.width * math.cos(turn), self.hinge[1] + self.width * math.sin(turn)
 
-    def leaf(self, angle: float, wall: WallStyle) -> Box:
-        """Return the leaf, opened by `angle` radians (0: closed), turning at the wall's face on the swing side."""
+    def leaf(self, angle: float, thickness: float) -> Box:
+        """Return the leaf, opened by `angle` radians (0: closed), at the swing side's face of a wall so thick."""
         turn, side = math.radians(self.heading), 1.0 if self.swing == "left" else -1.0
-        offset = side * (wall.thickness - LEAF_THICKNESS) / 2
+        offset = side * (thickness - LEAF_THICKNESS) / 2
         x, y = self.hinge[0] - offset * math.sin(turn), self.hinge[1] + offset * math.cos(turn)
         turn += side * angle
         length = self.width - 0.01  # a gap, so that the leaf does not cut into the jamb
@@ -86,18 +100,26 @@ class Pillar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An axis-aligned piece of wall, as imported buildings have them."""
+    """A box of wall, as imported buildings have them: two corners, then turned by `heading` about the middle."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
+    heading: float = 0.0
+    part_of: str = ""  # blocks of one name are one body
 
 
 class Room(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A room by the centre lines of its walls; people live in populated ones."""
+    """A room by the centre lines of its walls, or by a rectangle; people live in populated ones."""
 
     name: str
-    polygon: list[Point]
+    polygon: list[Point] = []
+    rectangle: tuple[float, float, float, float] | None = None  # x_min, y_min, x_max, y_max
     populated: bool = False
+
+    def __post_init__(self) -> None:
+        if self.rectangle is not None and not self.polygon:
+            x0, y0, x1, y1 = self.rectangle
+            msgspec.structs.force_setattr(self, "polygon", [(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
 
     def contains(self, points: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
         """Say which of the points (n, 2) lie inside the polygon."""
@@ -139,7 +161,9 @@ class Building(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str = "building"
     wall: WallStyle = WallStyle()
     start: Pose2 | None = None
-    walls: list[list[Point]] = []
+    boxes: str | None = None  # an ASCII PLY of boxes beside the file, raised to walls
+    map: str | None = None  # a ROS map beside the file, its occupied cells raised to walls
+    walls: list[list[Point] | Wall] = []
     blocks: list[Block] = []
     passages: list[Passage] = []
     pillars: list[Pillar] = []
@@ -148,17 +172,29 @@ class Building(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tables: list[TablePosition] = []
     tours: dict[str, Tour] = {}
 
-    def segments(self) -> list[tuple[Point, Point]]:
-        """Return the centre lines of the walls, one straight piece each."""
-        return [(a, b) for line in self.walls for a, b in zip(line, line[1:], strict=False)]
+    def segments(self) -> list[Segment]:
+        """Return the straight pieces of all walls."""
+        found = []
+        for index, entry in enumerate(self.walls):
+            wall = entry if isinstance(entry, Wall) else Wall(entry)
+            thickness = self.wall.thickness if wall.thickness is None else wall.thickness
+            height = self.wall.height if wall.height is None else wall.height
+            pairs = zip(wall.line, wall.line[1:], strict=False)
+            found += [Segment(index, a, b, thickness, height) for a, b in pairs]
+        return found
 
     def bounds(self) -> tuple[float, float, float, float]:
-        """Return x_min, y_min, x_max, y_max of all walls and blocks."""
-        points = [point for line in self.walls for point in line]
-        points += [corner[:2] for block in self.blocks for corner in (block.low, block.high)]
+        """Return x_min, y_min, x_max, y_max of all walls and blocks. Raises BuildingError if there are none."""
+        segments = self.segments()
+        points = [point for segment in segments for point in (segment.start, segment.end)]
+        for block in self.blocks:
+            middle, reach = np.add(block.low, block.high)[:2] / 2, np.subtract(block.high, block.low)[:2] / 2
+            if block.heading % 180.0:
+                reach = np.full(2, math.hypot(*reach))
+            points += [tuple(middle - reach), tuple(middle + reach)]
         if not points:
             raise BuildingError(f"building {self.name}: no walls; give walls, or boxes, or a map")
-        ring, half = np.array(points), self.wall.thickness / 2
+        ring, half = np.array(points), max([segment.thickness for segment in segments], default=0.0) / 2
         low, high = ring.min(0) - half, ring.max(0) + half
         return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
@@ -181,95 +217,3 @@ class Building(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def populated_area(self) -> float:
         """Return the floor area of the populated rooms in square metres."""
         return sum(room.area(self.wall) for room in self.rooms if room.populated)
-
-    def wall_bodies(self) -> list[Body]:
-        """Return walls (cut by doors and passages), pillars and blocks as bodies."""
-        bodies = [self._wall(index, a, b) for index, (a, b) in enumerate(self.segments())]
-        for index, pillar in enumerate(self.pillars):
-            box = Box(
-                *pillar.at,
-                self.wall.height / 2,
-                *pillar.size,
-                self.wall.height,
-                math.radians(pillar.heading),
-            )
-            bodies.append(Body(f"pillar {index}", Truth.WALL, (box,)))
-        for index, block in enumerate(self.blocks):
-            low, high = np.array(block.low), np.array(block.high)
-            bodies.append(Body(f"block {index}", Truth.WALL, (Box(*((low + high) / 2), *(high - low)),)))
-        return bodies
-
-    def openings(self, a: Point, b: Point) -> list[tuple[float, float, float]]:
-        """Return (from, to, lintel) of the doors and passages in the wall a to b, as metres along it, in order."""
-        start, direction, length = _line(a, b)
-        found = []
-        gaps = [(door.hinge, door.end(), door.lintel) for door in self.doors]
-        gaps += [(gap.start, gap.end, self.wall.height if gap.lintel is None else gap.lintel) for gap in self.passages]
-        for first, second, lintel in gaps:
-            along, across = zip(*(_project(point, start, direction) for point in (first, second)), strict=True)
-            if (
-                max(abs(offset) for offset in across) < ON_WALL
-                and min(along) > -ON_WALL
-                and max(along) < length + ON_WALL
-            ):
-                found.append((min(along), max(along), lintel))
-        return sorted(found)
-
-    def _wall(self, index: int, a: Point, b: Point) -> Body:
-        start, direction, length = _line(a, b)
-        turn, thickness, height = math.atan2(direction[1], direction[0]), self.wall.thickness, self.wall.height
-
-        def piece(first: float, last: float, low: float) -> Box:
-            x, y = start + direction * (first + last) / 2
-            return Box(float(x), float(y), (low + height) / 2, last - first, thickness, height - low, turn)
-
-        parts: list[Box] = []
-        reached = -thickness / 2  # walls reach half a thickness beyond their ends, which closes the corners
-        for first, last, lintel in self.openings(a, b):
-            if first > reached:
-                parts.append(piece(reached, first, 0.0))
-            if lintel < height:
-                parts.append(piece(first, last, lintel))
-            reached = max(reached, last)
-        if length + thickness / 2 > reached:
-            parts.append(piece(reached, length + thickness / 2, 0.0))
-        return Body(f"wall {index}", Truth.WALL, tuple(parts))
-
-
-def _line(a: Point, b: Point) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], float]:
-    start, reach = np.array(a, np.float64), np.subtract(b, a)
-    length = float(np.hypot(*reach))
-    return start, reach / max(length, 1e-9), length
-
-
-def _project(point: Point, start: npt.NDArray[np.float64], direction: npt.NDArray[np.float64]) -> tuple[float, float]:
-    x, y = point[0] - start[0], point[1] - start[1]
-    return float(x * direction[0] + y * direction[1]), float(y * direction[0] - x * direction[1])
-
-
-def find(path: Path | str, shipped: Path = SHIPPED) -> Path:
-    """Return the file that a path means: as it is, or one that comes with the package. Raises BuildingError."""
-    path = Path(path)
-    for candidate in (path, shipped.parents[1] / path, shipped / path, shipped / f"{path.name}.yaml"):
-        if candidate.is_file():
-            return candidate
-    raise BuildingError(
-        f"no file {path}; shipped are {', '.join(sorted(entry.stem for entry in shipped.glob('*.yaml')))}"
-    )
-
-
-def load(path: Path | str) -> Building:
-    """Read a building from YAML.
-
-    Raises BuildingError with file, line or field if the file is no YAML or not of the form. Geometry is not judged
-    here.
-    """
-    source = find(path)
-    try:
-        content = yaml.safe_load(source.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise BuildingError(f"{source}: not YAML: {error}") from error
-    try:
-        return msgspec.convert(content, Building)
-    except msgspec.ValidationError as error:
-        raise BuildingError(f"{source}: {error}") from error

@@ -20,7 +20,7 @@ HEADROOM = 1.9  # metres: what hangs higher is in nobody's way
 
 
 class Clearance(NamedTuple):
-    """Distance to the nearest obstacle in metres, 0 inside; cell [row, column] is at origin + resolution * (column, row)."""
+    """Distance to the nearest obstacle in metres, 0 inside; cell [row, column] is at x, y + resolution * (column, row)."""
 
     distance: Grid
     x: float

@@ -182,7 +182,7 @@ def figures(phase: Array, stride_share: Array, height: Array) -> Array:
 
 
 def placed(capsules: Array, x: Array, y: Array, heading: Array) -> Array:
-    """Move capsules (n, 16, 2, 3) from the figures' frames to positions (metres) and headings (radians) in the world."""
+    """Move capsules (n, 16, 2, 3) from the figures' frames to places (metres) and headings (radians) in the world."""
     cosine, sine = np.cos(heading)[:, None, None], np.sin(heading)[:, None, None]
     world = np.empty_like(capsules)
     world[..., 0] = cosine * capsules[..., 0] - sine * capsules[..., 1] + x[:, None, None]

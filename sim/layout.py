@@ -11,8 +11,9 @@ import numpy.typing as npt
 from sim.building import Building, BuildingError
 from sim.clearance import Clearance, clearance, route
 from sim.furniture import TABLES, chair_body, table_body
+from sim.masonry import door_leaf, wall_bodies
 from sim.scenario import Scenario
-from sim.solids import Body, Truth
+from sim.solids import Body
 
 Array = npt.NDArray[np.float64]
 
@@ -45,7 +46,7 @@ class Layout(NamedTuple):
 def draw(building: Building, scenario: Scenario, tour: str, seed: int) -> Layout:
     """Draw one session's layout. Raises BuildingError if a target of the tour cannot be reached."""
     rng = np.random.default_rng([seed, 1])
-    walls = building.wall_bodies()
+    walls = wall_bodies(building)
     bounds = building.bounds()
     empty = clearance(walls, bounds, RESOLUTION)
     way = _way(building, empty, tour)
@@ -101,7 +102,7 @@ def _leaves(building: Building, way: Array, rng: np.random.Generator) -> list[Bo
             angle = math.radians(85.0 + 20.0 * draws[1])
         else:
             angle = 0.0 if draws[0] < CLOSED_SHARE else math.radians(15.0 + 90.0 * draws[1])
-        leaves.append(Body(f"door {door.name or index}", Truth.DOOR, (door.leaf(angle, building.wall),)))
+        leaves.append(door_leaf(building, index, angle))
     return leaves
 
 

@@ -41,7 +41,7 @@ PRESETS = {
 
 
 class Hits(NamedTuple):
-    """What each ray of a scan met, beam by beam: range in metres (inf: nothing), body or NOTHING, cosine of incidence."""
+    """What each ray of a scan met, beam by beam: range (metres, inf: nothing), body or NOTHING, cosine of incidence."""
 
     distance: npt.NDArray[np.float32]  # (beams * columns,)
     body: npt.NDArray[np.int32]

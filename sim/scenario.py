@@ -7,7 +7,8 @@ from pathlib import Path
 import msgspec
 import yaml
 
-from sim.building import BuildingError, find
+from sim.building import BuildingError
+from sim.building_file import find
 from sim.furniture import TABLES
 
 SHIPPED = Path(__file__).parent / "scenarios"

@@ -1,4 +1,4 @@
-"""Boxes and prisms, of which every body that stands still is made: the triangles that rays hit are those that collide."""
+"""Boxes and prisms, of which all that stands still is made: the triangles that rays hit are those that collide."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Box(NamedTuple):
         turned = np.stack(
             [corners[:, 0] * cosine - corners[:, 1] * sine, corners[:, 0] * sine + corners[:, 1] * cosine], 1
         )
-        placed = np.concatenate([turned, corners[:, 2:]], 1) + (self.x, self.y, self.z)
+        placed = np.column_stack([turned, corners[:, 2]]) + np.array([self.x, self.y, self.z])
         return placed[_FACES]
 
     def moved(self, x: float, y: float, yaw: float) -> Box:

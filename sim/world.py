@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from graph.geometry import interpolate, planar, wrap, yaw
-from sim.building import Building, BuildingError, load
+from sim.building import Building, BuildingError
+from sim.building_file import load
 from sim.crowd import Crowd, spots
 from sim.figure import figures, placed, radii, sitting
 from sim.furniture import SEAT_HEIGHT
