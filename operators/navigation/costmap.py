@@ -10,7 +10,7 @@ from numba import njit
 
 from operators.navigation.distance import distance_to
 from operators.navigation.footprint import Footprint, Surroundings, inside
-from operators.navigation.lattice import Lattice, lattice_around, moved, resampled, union
+from operators.navigation.lattice import Box, Lattice, lattice_around, moved, resampled, union
 from operators.navigation.obstacles import ObstacleLayer
 from operators.navigation.search import BLOCKED
 
@@ -31,51 +31,77 @@ ESCAPE_RADIUS = 0.6  # metres
 
 @njit(cache=True)
 def weigh(
+    weights: npt.NDArray[np.int32],
     distance: npt.NDArray[np.float32],
-    known: npt.NDArray[np.bool_],
+    cells: npt.NDArray[np.int8],
+    seen: npt.NDArray[np.bool_],
     lethal: float,
     inflation: float,
-    start: tuple[int, int],
-) -> npt.NDArray[np.int32]:
-    """Give each coarse cell its weight: BLOCKED below `lethal` metres, falling to FREE at `inflation`.
+    box: Box,
+    robot: tuple[float, float],
+) -> None:
+    """Fill in the weights of a box of coarse cells: BLOCKED below `lethal` metres, falling to FREE at `inflation`.
 
-    distance, known (rows, columns) on the fine raster; a coarse cell's distance is the mean of its four. Around `start`
-    (coarse row and column), the robot, cells that are not themselves occupied are left open at the weight ESCAPE.
+    distance, cells, seen (rows, columns) on the fine raster; a coarse cell's distance is the mean of its four. Around
+    the robot (row and column on the coarse raster) cells that are not themselves occupied are left open at the weight
+    ESCAPE, and floor that nobody has seen is doubtful.
     """
-    rows, columns = distance.shape[0] // COARSE, distance.shape[1] // COARSE
-    weights = np.empty((rows, columns), np.int32)
-    for row in range(rows):
-        for column in range(columns):
-            total, least, seen = 0.0, 1e9, True
+    for row in range(box.top, box.bottom):
+        for column in range(box.left, box.right):
+            total, least, known = 0.0, 1e9, True
             for down in range(COARSE):
                 for right in range(COARSE):
-                    value = float(distance[COARSE * row + down, COARSE * column + right])
-                    total += value
-                    least = min(least, value)
-                    seen = seen and known[COARSE * row + down, COARSE * column + right]
+                    place = COARSE * row + down, COARSE * column + right
+                    total += distance[place]
+                    least = min(least, distance[place])
+                    known = known and (cells[place] >= 0 or seen[place])
             mean = total / (COARSE * COARSE)
-            away = CELL * COARSE * math.sqrt((row - start[0]) ** 2 + (column - start[1]) ** 2)
+            away = CELL * COARSE * math.sqrt((row - robot[0]) ** 2 + (column - robot[1]) ** 2)
             if mean < lethal:
                 weights[row, column] = ESCAPE if away <= ESCAPE_RADIUS and least > 0.0 else BLOCKED
                 continue
             weight = FREE
-            if not seen:
+            if not known:
                 weight += DOUBTFUL if away <= DOUBT_RADIUS else UNKNOWN
             if mean < inflation:
                 closeness = (inflation - mean) / (inflation - lethal)
                 weight += int(TIGHT * closeness * closeness)
             weights[row, column] = weight
-    return weights
+
+
+@njit(cache=True)
+def _changed(old: npt.NDArray[np.int8], new: npt.NDArray[np.int8]) -> tuple[int, int, int, int]:
+    """Return the box of cells that became or ceased to be unknown or occupied."""
+    top, bottom, left, right = old.shape[0], 0, old.shape[1], 0
+    for row in range(old.shape[0]):
+        for column in range(old.shape[1]):
+            a, b = old[row, column], new[row, column]
+            if (a < 0) != (b < 0) or (a >= OCCUPIED) != (b >= OCCUPIED):
+                top, bottom = min(top, row), max(bottom, row + 1)
+                left, right = min(left, column), max(right, column + 1)
+    return top, bottom, left, right
+
+
+FAR_AWAY = (-1e6, -1e6)  # where no robot is
+NOWHERE = Box(0, 0, 0, 0)
 
 
 class Costmap:
-    """The map's cells and the obstacles seen, on one raster that grows with the world."""
+    """The map's cells and the obstacles seen, and what they cost, on one raster that grows with the world."""
 
-    def __init__(self, *, reach: float = 8.0) -> None:
-        """Start with nothing known. reach: metres around the lidar within which obstacles are entered and removed."""
+    def __init__(self, *, lethal: float, inflation: float, reach: float = 8.0) -> None:
+        """Start with nothing known. Lengths in metres.
+
+        lethal: distance from a thing below which the robot's centre touches it; inflation: distance from which nearness
+        costs nothing; reach: around the lidar, within which obstacles are entered and removed.
+        """
+        self.lethal, self.inflation = lethal, inflation
         self.lattice = Lattice(CELL, 0, 0, 0, 0)
         self.cells = np.full((0, 0), -1, np.int8)  # of the map: -1 unknown, 0 free to 100 occupied
         self.obstacles = ObstacleLayer(self.lattice, reach=reach)
+        self._distance = np.full((0, 0), inflation, np.float32)
+        self._weights = np.full((0, 0), FREE + UNKNOWN, np.int32)  # coarse
+        self._stale = NOWHERE  # cells whose distances and weights are to be computed anew
 
     def cover(self, *positions: tuple[float, float]) -> None:
         """Grow the raster so that it reaches MARGIN beyond each position (x, y in metres)."""
@@ -89,6 +115,12 @@ class Costmap:
         if lattice == self.lattice:
             return
         self.cells = moved(self.cells, self.lattice, lattice, -1)
+        self._distance = moved(self._distance, self.lattice, lattice, self.inflation)
+        coarse = self.lattice.coarse(COARSE), lattice.coarse(COARSE)
+        self._weights = moved(self._weights, *coarse, FREE + UNKNOWN)
+        down, right = self.lattice.first_row - lattice.first_row, self.lattice.first_column - lattice.first_column
+        stale = self._stale
+        self._stale = Box(stale.top + down, stale.bottom + down, stale.left + right, stale.right + right)
         self.obstacles.grow(lattice)
         self.lattice = lattice
 
@@ -97,7 +129,14 @@ class Costmap:
         lower = np.asarray(origin, np.float64)
         upper = lower + resolution * np.array([cells.shape[1], cells.shape[0]])
         self._grow(lattice_around(CELL, lower - MARGIN, upper + MARGIN, block=BLOCK))
-        self.cells = resampled(cells, lower, resolution, self.lattice)
+        fresh = resampled(cells, lower, resolution, self.lattice)
+        self._stale = self._stale.joined(Box(*_changed(self.cells, fresh)))
+        self.cells = fresh
+
+    def observe(self, points: npt.NDArray[np.float32], world_from_lidar: npt.NDArray[np.float64], floor: float) -> None:
+        """Enter a frame: points (n, 3) in the lidar frame; floor: its height in the world, metres."""
+        self.cover((float(world_from_lidar[0, 3]), float(world_from_lidar[1, 3])))
+        self._stale = self._stale.joined(self.obstacles.observe(points, world_from_lidar, floor))
 
     def clear_footprint(self, footprint: Footprint, pose: tuple[float, float, float]) -> None:
         """Empty what seems to stand where the robot (x, y, yaw) itself stands."""
@@ -110,26 +149,56 @@ class Costmap:
         where = rows[taken], columns[taken]
         self.obstacles.erase(*where)
         self.cells[where] = np.minimum(self.cells[where], 0)
+        self._touch(row, column, reach)
 
-    def weights(
-        self, robot: tuple[float, float], *, lethal: float, inflation: float, seen: bool = True
-    ) -> npt.NDArray[np.int32]:
+    def weights(self, robot: tuple[float, float], *, seen: bool = True) -> npt.NDArray[np.int32]:
         """Return the coarse raster's weights, for a search to a robot's position; by the map alone if not `seen`."""
-        taken = self.cells >= OCCUPIED
+        coarse = self.lattice.coarse(COARSE)
+        row, column = coarse.cell(*robot)
+        around = Box(row, row + 1, column, column + 1).grown(math.ceil(DOUBT_RADIUS / CELL / COARSE) + 1, coarse)
+        costs = self.lethal, self.inflation
         if seen:
-            taken |= self.obstacles.filled
-        distance = distance_to(taken, CELL, inflation)
-        known = (self.cells >= 0) | self.obstacles.seen
-        return weigh(distance, known, lethal, inflation, self.lattice.coarse(COARSE).cell(*robot))
+            self._refresh()
+            weights, distance = self._weights.copy(), self._distance
+        else:
+            weights, distance = np.empty_like(self._weights), distance_to(self.cells >= OCCUPIED, CELL, self.inflation)
+            whole = Box(0, coarse.rows, 0, coarse.columns)
+            weigh(weights, distance, self.cells, self.obstacles.seen, *costs, whole, FAR_AWAY)
+        weigh(weights, distance, self.cells, self.obstacles.seen, *costs, around, (float(row), float(column)))
+        return weights
+
+    def _refresh(self) -> None:
+        """Compute distances and weights anew where something changed, and as far around as it can matter."""
+        if self._stale.empty:
+            return
+        reach = math.ceil(self.inflation / CELL) + 1
+        inner = self._stale.grown(reach, self.lattice)
+        outer = inner.grown(reach, self.lattice)
+        part = slice(outer.top, outer.bottom), slice(outer.left, outer.right)
+        taken = (self.cells[part] >= OCCUPIED) | self.obstacles.filled[part]
+        distance = distance_to(taken, CELL, self.inflation)
+        rows, columns = slice(inner.top, inner.bottom), slice(inner.left, inner.right)
+        self._distance[rows, columns] = distance[
+            inner.top - outer.top : inner.bottom - outer.top, inner.left - outer.left : inner.right - outer.left
+        ]
+        box = Box(inner.top // COARSE, -(-inner.bottom // COARSE), inner.left // COARSE, -(-inner.right // COARSE))
+        costs = self.lethal, self.inflation
+        weigh(self._weights, self._distance, self.cells, self.obstacles.seen, *costs, box, FAR_AWAY)
+        self._stale = NOWHERE
 
     def trust(self, x: float, y: float, radius: float) -> None:
         """Take for free what nobody has seen within `radius` metres of a position."""
         rows, columns = self._unseen(x, y, radius)
         self.obstacles.seen[rows, columns] = True
+        self._touch(*self.lattice.cell(x, y), math.ceil(radius / CELL))
 
     def distrust(self, x: float, y: float) -> None:
         """Take for occupied what nobody has seen around a position, as far as it may hide in the lidar's blind ring."""
         self.obstacles.fill(*self._unseen(x, y, DOUBT_RADIUS))
+        self._touch(*self.lattice.cell(x, y), math.ceil(DOUBT_RADIUS / CELL))
+
+    def _touch(self, row: int, column: int, cells: int) -> None:
+        self._stale = self._stale.joined(Box(row, row + 1, column, column + 1).grown(cells, self.lattice))
 
     def _unseen(self, x: float, y: float, radius: float) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         """Return rows and columns (n,) of the cells around a position that neither map nor lidar knows."""

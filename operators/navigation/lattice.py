@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 
 class Lattice(NamedTuple):
@@ -78,23 +79,73 @@ def moved(cells: npt.NDArray[Any], source: Lattice, target: Lattice, fill: float
     return result
 
 
+@njit(cache=True)
+def _spread(
+    cells: npt.NDArray[np.int8],
+    corner: tuple[float, float],
+    size: float,
+    parts: int,
+    result: npt.NDArray[np.int8],
+    first: tuple[int, int],
+    resolution: float,
+) -> None:
+    for row in range(cells.shape[0] * parts):
+        y = corner[1] + (row + 0.5) * size / parts
+        to_row = math.floor(y / resolution + 1e-6) - first[0]
+        if to_row < 0 or to_row >= result.shape[0]:
+            continue
+        for column in range(cells.shape[1] * parts):
+            x = corner[0] + (column + 0.5) * size / parts
+            to_column = math.floor(x / resolution + 1e-6) - first[1]
+            if 0 <= to_column < result.shape[1]:
+                value = cells[row // parts, column // parts]
+                result[to_row, to_column] = max(result[to_row, to_column], value)
+
+
 def resampled(
-    cells: npt.NDArray[Any], origin: npt.ArrayLike, resolution: float, target: Lattice
+    cells: npt.NDArray[np.int8], origin: npt.ArrayLike, resolution: float, target: Lattice
 ) -> npt.NDArray[np.int8]:
     """Put a foreign grid (origin in metres, any resolution) onto a raster; the greatest value wins, -1 where none is.
 
     Cells larger than the raster's are spread over all that they cover; smaller ones are gathered.
     """
-    x0, y0 = np.asarray(origin, np.float64)
+    x, y = (float(number) for number in np.asarray(origin, np.float64))
     parts = max(1, math.ceil(resolution / target.resolution - 1e-6))
     result = np.full((target.rows, target.columns), -1, np.int8)
-    for part_row in range(parts):
-        centre_y = y0 + (np.arange(cells.shape[0]) + (part_row + 0.5) / parts) * resolution
-        rows = np.floor(centre_y / target.resolution + 1e-6).astype(int) - target.first_row
-        for part_column in range(parts):
-            centre_x = x0 + (np.arange(cells.shape[1]) + (part_column + 0.5) / parts) * resolution
-            columns = np.floor(centre_x / target.resolution + 1e-6).astype(int) - target.first_column
-            keep_row, keep_column = (rows >= 0) & (rows < target.rows), (columns >= 0) & (columns < target.columns)
-            where = np.ix_(rows[keep_row], columns[keep_column])
-            np.maximum.at(result, where, cells[np.ix_(keep_row, keep_column)].astype(np.int8))
+    own = np.array(cells, np.int8)  # a copy: messages are read-only, which is another type to numba
+    _spread(own, (x, y), resolution, parts, result, (target.first_row, target.first_column), target.resolution)
     return result
+
+
+class Box(NamedTuple):
+    """A rectangle of a raster's cells: from the first to before the last."""
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+    @property
+    def empty(self) -> bool:
+        """Say whether it holds no cell."""
+        return self.bottom <= self.top or self.right <= self.left
+
+    def grown(self, cells: int, lattice: Lattice) -> Box:
+        """Return the box with a margin, cut to a raster."""
+        return Box(
+            max(self.top - cells, 0),
+            min(self.bottom + cells, lattice.rows),
+            max(self.left - cells, 0),
+            min(self.right + cells, lattice.columns),
+        )
+
+    def joined(self, other: Box) -> Box:
+        """Return the smallest box that holds both."""
+        if self.empty or other.empty:
+            return other if self.empty else self
+        return Box(
+            min(self.top, other.top),
+            max(self.bottom, other.bottom),
+            min(self.left, other.left),
+            max(self.right, other.right),
+        )

@@ -78,10 +78,10 @@ class Navigator:
         """
         self.footprint = footprint or Footprint()
         self.limits = limits or Limits()
-        self.costmap = Costmap()
+        self.costmap = Costmap(lethal=self.footprint.inscribed + padding + 0.5 * CELL, inflation=inflation)
         self.commands = Commands(latency)
         self.window = DynamicWindow(self.footprint, self.limits, horizon=horizon, padding=padding)
-        self._inflation, self._side = inflation, side
+        self._side = side
         self._goal: tuple[float, float] | None = None
         self._field: Field | None = None
         self._field_lattice = Lattice(CELL * COARSE, 0, 0, 0, 0)
@@ -110,10 +110,7 @@ class Navigator:
 
     def observe(self, points: npt.NDArray[np.float32], world_from_base: Matrix, base_from_lidar: Matrix) -> None:
         """Enter a frame: points (n, 3) in the lidar frame, and where the base was when it was taken."""
-        x, y = float(world_from_base[0, 3]), float(world_from_base[1, 3])
-        self.costmap.cover((x, y))
-        floor = float(world_from_base[2, 3])
-        self.costmap.obstacles.observe(points, world_from_base @ base_from_lidar, floor)
+        self.costmap.observe(points, world_from_base @ base_from_lidar, float(world_from_base[2, 3]))
 
     def step(self, measured_at: int, world_from_base: Matrix, *, valid: bool = True) -> Decision:
         """Decide what to do from a pose measured at a time in nanoseconds; drive carefully when it is not valid."""
@@ -155,10 +152,9 @@ class Navigator:
         self._until_replan = REPLAN
         lattice = self.costmap.lattice.coarse(COARSE)
         start = lattice.cell(pose[0], pose[1])
-        lethal = self.footprint.inscribed + self.window.padding + 0.5 * CELL
         per_metre = FREE * UNIT / lattice.resolution
         for seen in (True, False):
-            weights = self.costmap.weights(pose[:2], lethal=lethal, inflation=self._inflation, seen=seen)
+            weights = self.costmap.weights(pose[:2], seen=seen)
             sources, costs = self._sources(weights, lattice, per_metre)
             field = cost_to_go(weights, sources, costs, start=start, margin=round(BEYOND * per_metre))
             found = field.cost[start] != UNREACHED

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from numba import njit
 
 from graph.geometry import inverse
-from operators.navigation.lattice import Lattice, moved
+from operators.navigation.lattice import Box, Lattice, moved
 
 LOWEST, HIGHEST = 0.1, 1.2  # metres above the floor: what the robot can hit
 LEVEL = 0.1  # metres
@@ -86,12 +86,12 @@ def wear(
     floor: float,
     corner: tuple[float, float],
     resolution: float,
-    box: tuple[int, int, int, int],
+    box: Box,
 ) -> None:
-    """Take life from the voxels within a box (rows, then columns: from, to) that this frame's rays passed through."""
+    """Take life from the voxels within a box of cells that this frame's rays passed through."""
     margin = 2.0 * resolution
-    for row in range(box[0], box[1]):
-        for column in range(box[2], box[3]):
+    for row in range(box.top, box.bottom):
+        for column in range(box.left, box.right):
             if not filled[row, column]:
                 continue
             world_x, world_y = corner[0] + (column + 0.5) * resolution, corner[1] + (row + 0.5) * resolution
@@ -211,23 +211,21 @@ class ObstacleLayer:
 
     def observe(
         self, points: npt.NDArray[np.float32], world_from_lidar: npt.NDArray[np.float64], floor: float = 0.0
-    ) -> None:
-        """Enter a frame: points (n, 3) in the lidar frame; floor: its height in the world, metres."""
+    ) -> Box:
+        """Enter a frame: points (n, 3) in the lidar frame; floor: its height in the world, metres.
+
+        Returns the cells among which something may have changed.
+        """
         pose = np.array(world_from_lidar, np.float64)  # a copy: messages are read-only, which is another type to numba
         points = np.array(points, np.float32)
-        cells = math.ceil(self.reach / self.lattice.resolution)
         row, column = self.lattice.cell(pose[0, 3], pose[1, 3])
-        box = (
-            max(row - cells, 0),
-            min(row + cells + 1, self.lattice.rows),
-            max(column - cells, 0),
-            min(column + cells + 1, self.lattice.columns),
-        )
+        box = Box(row, row + 1, column, column + 1).grown(math.ceil(self.reach / self.lattice.resolution), self.lattice)
         layers = self._life, self._height, self.filled
         place = self.lattice.origin, self.lattice.resolution
         wear(*layers, panorama(points), inverse(pose), floor, *place, box)
         strike(*layers, points, pose, floor, *place, self.reach)
         look(self.seen, points, pose, floor, *place, LOOK)
+        return box
 
     def erase(self, rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64]) -> None:
         """Empty columns of the raster by their indices (n,): they are known to be free."""

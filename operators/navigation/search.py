@@ -16,7 +16,7 @@ UNREACHED = np.int32(2**31 - 1)
 # the raster forces on a straight way is 3 %, with eight neighbours it would be 8 %.
 UNIT = 24
 STRAIGHT, DIAGONAL, KNIGHT = 12, 17, 27
-FRAME = 2  # cells around the grid, the reach of a knight's move
+BORDER = 2  # cells, the reach of a knight's move: so wide a rim is blocked, that no move leaves the grid
 MOVES = np.array(
     [
         *[(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)],
@@ -30,7 +30,7 @@ class Field(NamedTuple):
     """What the search found: costs to the goal, UNREACHED where there is no way, and the next cell on the way."""
 
     cost: npt.NDArray[np.int32]  # (rows, columns), UNIT a cell of weight 1
-    following: npt.NDArray[np.int32]  # (rows, columns), flat index; its own at the goal, -1 where there is no way
+    following: npt.NDArray[np.int32]  # (rows, columns), flat index; its own at the goal; nothing where there is no way
 
 
 @njit(cache=True)
@@ -65,7 +65,7 @@ def _link(
 
 @njit(cache=True)
 def _search(
-    weights: npt.NDArray[np.int32],  # (cells,), with a frame of two blocked cells, so that no move leaves the grid
+    weights: npt.NDArray[np.int32],  # (cells,)
     sources: npt.NDArray[np.int64],
     starting_costs: npt.NDArray[np.int32],
     moves: npt.NDArray[np.int64],  # (16, 3): flat steps to the end, to the first and to the second cell on the way
@@ -75,9 +75,9 @@ def _search(
     """Settle cells by buckets as wide as the cheapest step: within one, none can improve another (Dial)."""
     cells = len(weights)
     cost = np.full(cells, UNREACHED, np.int32)
-    following = np.full(cells, -1, np.int32)
-    after = np.full(cells, -1, np.int32)
-    before = np.full(cells, -1, np.int32)
+    following = np.empty(cells, np.int32)
+    after = np.empty(cells, np.int32)
+    before = np.empty(cells, np.int32)
     most, least = 1, 1 << 20
     for flat in range(cells):
         if weights[flat] != BLOCKED:
@@ -148,27 +148,22 @@ def cost_to_go(
 ) -> Field:
     """Find the cheapest way from every cell to the nearest source.
 
-    weights (rows, columns): 0 blocked, else at least 1. sources: flat indices of the goal cells; starting_costs: what
-    each costs by itself, 0 by default. start: stop when all is settled up to the cost of this cell plus `margin`; cells
-    beyond keep an upper bound. The order of settling is fixed, so that equal inputs give equal ways.
+    weights (rows, columns): 0 blocked, else at least 1; a rim of BORDER cells counts as blocked. sources: flat indices
+    of the goal cells; starting_costs: what each costs by itself, 0 by default. start: stop when all is settled up to
+    the cost of this cell plus `margin`; cells beyond keep an upper bound. The order of settling is fixed, so that
+    equal inputs give equal ways.
     Source: Dijkstra 1959; buckets: Dial 1969.
     """
-    rows, columns = weights.shape
-    wide = columns + 2 * FRAME
-    framed = np.zeros((rows + 2 * FRAME, wide), np.int32)
-    framed[FRAME:-FRAME, FRAME:-FRAME] = weights
-    inner = np.arange(framed.size).reshape(framed.shape)[FRAME:-FRAME, FRAME:-FRAME]
+    inner = np.zeros(weights.shape, np.int32)
+    inner[BORDER:-BORDER, BORDER:-BORDER] = weights[BORDER:-BORDER, BORDER:-BORDER]
+    columns = weights.shape[1]
     ends, halves = MOVES, np.trunc(MOVES / 2).astype(np.int64)  # a knight's move goes straight ahead, then aslant
     halves[4:8, 0] = MOVES[4:8, 0]  # a diagonal one goes between the cells above and beside
-    moves = np.stack([ends, halves, ends - halves], axis=1) @ np.array([wide, 1])  # (16, 3)
-    flat_sources = inner.reshape(-1)[np.asarray(sources, np.int64)]
+    moves = np.stack([ends, halves, ends - halves], axis=1) @ np.array([columns, 1])  # (16, 3)
     costs = np.zeros(len(sources), np.int32) if starting_costs is None else starting_costs.astype(np.int32)
-    target = -1 if start is None else int(inner[start])
-    cost, following = _search(framed.reshape(-1), flat_sources, costs, moves, target, margin)
-    cost, following = cost.reshape(framed.shape), following.reshape(framed.shape)
-    next_row, next_column = np.divmod(following[FRAME:-FRAME, FRAME:-FRAME], np.int32(wide))
-    way = np.where(next_row < 0, np.int32(-1), (next_row - FRAME) * np.int32(columns) + next_column - FRAME)
-    return Field(np.ascontiguousarray(cost[FRAME:-FRAME, FRAME:-FRAME]), way.astype(np.int32))
+    target = -1 if start is None else start[0] * columns + start[1]
+    cost, following = _search(inner.reshape(-1), np.asarray(sources, np.int64), costs, moves, target, margin)
+    return Field(cost.reshape(weights.shape), following.reshape(weights.shape))
 
 
 @njit(cache=True)
@@ -177,7 +172,7 @@ def _trace(following: npt.NDArray[np.int32], start: int, most: int) -> npt.NDArr
     count = 0
     flat = start
     columns = following.shape[1]
-    while flat >= 0 and count < most:
+    while count < most:
         cells[count] = flat
         count += 1
         step = following[flat // columns, flat % columns]
@@ -190,7 +185,7 @@ def _trace(following: npt.NDArray[np.int32], start: int, most: int) -> npt.NDArr
 def trace(field: Field, row: int, column: int) -> npt.NDArray[np.int64]:
     """Return the cells (n, row and column) of the cheapest way from a cell to the goal; empty where there is none."""
     columns = field.cost.shape[1]
-    if field.following[row, column] < 0:
+    if field.cost[row, column] == UNREACHED:
         return np.empty((0, 2), np.int64)
     flat = _trace(field.following, row * columns + column, field.cost.size)
     return np.stack([flat // columns, flat % columns], axis=1)
