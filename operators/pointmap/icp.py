@@ -12,7 +12,7 @@ from numba import njit
 from operators.pointmap.draw import State, alias_table, sample
 from operators.pointmap.frame import Frame
 from operators.pointmap.nearest import nearest
-from operators.pointmap.store import NONE, Store
+from operators.pointmap.store import NONE, NORMAL, SCORE, Store
 
 Doubles = npt.NDArray[np.float64]
 
@@ -133,24 +133,28 @@ def step(
     normal_matrix = np.zeros((6, 6))
     right = np.zeros(6)
     row = np.empty(6)
+    turned_points = np.empty((count, 3))  # about the sensor
+    world_points = np.empty((count, 3))
+    for n in range(count):
+        x, y, z = float(points[chosen[n], 0]), float(points[chosen[n], 1]), float(points[chosen[n], 2])
+        for axis in range(3):
+            turned_points[n, axis] = pose[axis, 0] * x + pose[axis, 1] * y + pose[axis, 2] * z
+            world_points[n, axis] = turned_points[n, axis] + pose[axis, 3]
+    matches, _ = nearest(store, voxel, world_points, reach)
+    rows = store.rows
     pairs, error, total = 0, 0.0, 0.0
     for n in range(count):
-        i = chosen[n]
-        x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
-        rx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z
-        ry = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z
-        rz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z
-        wx, wy, wz = rx + pose[0, 3], ry + pose[1, 3], rz + pose[2, 3]
-        match, _ = nearest(store, voxel, wx, wy, wz, reach)
+        match = matches[n]
         if match == NONE:
             continue
-        nx, ny, nz = float(store.normals[match, 0]), float(store.normals[match, 1]), float(store.normals[match, 2])
-        distance = (
-            nx * (wx - store.points[match, 0]) + ny * (wy - store.points[match, 1]) + nz * (wz - store.points[match, 2])
-        )
+        nx, ny, nz = float(rows[match, NORMAL]), float(rows[match, NORMAL + 1]), float(rows[match, NORMAL + 2])
+        distance = nx * (world_points[n, 0] - rows[match, 0])
+        distance += ny * (world_points[n, 1] - rows[match, 1])
+        distance += nz * (world_points[n, 2] - rows[match, 2])
         if abs(distance) > plane_reach:
             continue
-        weight = store.scores[match] / (1.0 + (distance / width) ** 2)
+        rx, ry, rz = turned_points[n, 0], turned_points[n, 1], turned_points[n, 2]
+        weight = rows[match, SCORE] / (1.0 + (distance / width) ** 2)
         row[0], row[1], row[2] = nx, ny, nz
         row[3], row[4], row[5] = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
         for a in range(6):

@@ -8,13 +8,32 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from operators.pointmap.store import BLOCK_VOXELS, CELL_BLOCKS, NONE, Store, find
-from operators.pointmap.voxels import pack
+from operators.pointmap.store import (
+    BLOCK_BITS,
+    BLOCK_VOXELS,
+    CELL_BLOCKS,
+    HEAD,
+    KEY,
+    LINK,
+    MASK,
+    NONE,
+    SIZE,
+    START,
+    Floats,
+    Ints,
+    Longs,
+    Store,
+    find,
+    local_of,
+    ones_below,
+    voxel_of,
+)
+from operators.pointmap.voxels import pack, unpack
 
-Floats = npt.NDArray[np.float32]
+Doubles = npt.NDArray[np.float64]
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def gap(place: int, size: float, x: float) -> float:
     """Return the distance along one axis from x to the interval [place, place + 1] * size."""
     below, above = place * size - x, x - (place + 1) * size
@@ -22,108 +41,154 @@ def gap(place: int, size: float, x: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def search_block(
-    store: Store, block: int, x: float, y: float, z: float, point: int, square: float
+def search_voxels(
+    table: Longs, pool: Floats, voxel: float, x: float, y: float, z: float, reach: float
 ) -> tuple[int, float]:
-    """Return the nearest point so far and its squared distance, after all points of a block."""
-    candidate = int(store.block_head[block])
-    while candidate != NONE:
-        dx, dy, dz = store.points[candidate, 0] - x, store.points[candidate, 1] - y, store.points[candidate, 2] - z
-        d2 = dx * dx + dy * dy + dz * dz
-        if d2 < square:
-            point, square = candidate, d2
-        candidate = int(store.next_point[candidate])
-    return point, square
+    """Return the place in the pool of the nearest point and its squared distance, from the 27 voxels around (x, y, z).
+
+    table, pool: of the store, one by one, for to hand over all of it costs more than the search. voxel: metres. The
+    place is -1 if nothing is nearer than `reach`. Along each axis the voxel itself comes first, then the nearer and
+    then the farther neighbour, so that what cannot beat the nearest so far ends a loop.
+    """
+    place, square = NONE, np.float32(reach * reach)
+    px, py, pz = np.float32(x), np.float32(y), np.float32(z)
+    i, j, k = voxel_of(x, y, z, voxel)
+    left, front, below = x - i * voxel, y - j * voxel, z - k * voxel  # distances to the walls of the voxel
+    sa = -1 if 2.0 * left < voxel else 1
+    sb = -1 if 2.0 * front < voxel else 1
+    sc = -1 if 2.0 * below < voxel else 1
+    last_key, slot, mask = np.int64(-2), 0, np.int64(0)
+    for a in range(3):
+        u = i if a == 0 else (i + sa if a == 1 else i - sa)
+        ga = 0.0 if u == i else (left if u < i else voxel - left)
+        if ga * ga >= square:
+            break
+        for b in range(3):
+            v = j if b == 0 else (j + sb if b == 1 else j - sb)
+            gb = 0.0 if v == j else (front if v < j else voxel - front)
+            if ga * ga + gb * gb >= square:
+                break
+            for c in range(3):
+                w = k if c == 0 else (k + sc if c == 1 else k - sc)
+                gc = 0.0 if w == k else (below if w < k else voxel - below)
+                if ga * ga + gb * gb + gc * gc >= square:
+                    break
+                key = pack(u >> BLOCK_BITS, v >> BLOCK_BITS, w >> BLOCK_BITS)
+                if key != last_key:
+                    last_key = key
+                    slot = find(table, key)
+                    mask = table[slot, MASK] if table[slot, KEY] != NONE else np.int64(0)
+                local = local_of(u, v, w)
+                if (mask >> local) & 1:
+                    candidate = table[slot, START] + ones_below(mask, local)
+                    dx, dy, dz = pool[candidate, 0] - px, pool[candidate, 1] - py, pool[candidate, 2] - pz
+                    d2 = dx * dx + dy * dy + dz * dz
+                    if d2 < square:
+                        place, square = candidate, d2
+    return place, float(square)
+
+
+@njit(cache=True, error_model="numpy")
+def search_blocks(
+    table: Longs, pool: Floats, edge: float, x: float, y: float, z: float, place: int, square: float
+) -> tuple[int, float]:
+    """Return place and squared distance of the nearest so far, after the 27 blocks (of `edge` metres) around."""
+    least = np.float32(square)
+    px, py, pz = np.float32(x), np.float32(y), np.float32(z)
+    i, j, k = voxel_of(x, y, z, edge)
+    left, front, below = x - i * edge, y - j * edge, z - k * edge
+    for a in range(-1, 2):
+        ga = left if a < 0 else (edge - left if a > 0 else 0.0)
+        if ga * ga >= least:
+            continue
+        for b in range(-1, 2):
+            gb = front if b < 0 else (edge - front if b > 0 else 0.0)
+            if ga * ga + gb * gb >= least:
+                continue
+            for c in range(-1, 2):
+                gc = below if c < 0 else (edge - below if c > 0 else 0.0)
+                if ga * ga + gb * gb + gc * gc >= least:
+                    continue
+                slot = find(table, pack(i + a, j + b, k + c))
+                if table[slot, KEY] == NONE:
+                    continue
+                for candidate in range(table[slot, START], table[slot, START] + table[slot, SIZE]):
+                    dx, dy, dz = pool[candidate, 0] - px, pool[candidate, 1] - py, pool[candidate, 2] - pz
+                    d2 = dx * dx + dy * dy + dz * dz
+                    if d2 < least:
+                        place, least = candidate, d2
+    return place, float(least)
 
 
 @njit(cache=True, error_model="numpy")
 def search_cell(
-    store: Store, cell: int, size: float, x: float, y: float, z: float, point: int, square: float
+    store: Store, cell: int, edge: float, x: float, y: float, z: float, place: int, square: float
 ) -> tuple[int, float]:
-    """Return the nearest point so far and its squared distance, after all blocks (of `size` metres) of a cell."""
-    block = int(store.cell_head[cell])
+    """Return place and squared distance of the nearest so far, after the blocks (of `edge` metres) of a cell's slot."""
+    block = store.cells[cell, HEAD]
     while block != NONE:
-        dx = gap(store.block_place[block, 0], size, x)
-        dy = gap(store.block_place[block, 1], size, y)
-        dz = gap(store.block_place[block, 2], size, z)
+        key = store.blocks[block, KEY]
+        i, j, k = unpack(key)
+        dx, dy, dz = gap(i, edge, x), gap(j, edge, y), gap(k, edge, z)
         if dx * dx + dy * dy + dz * dz < square:
-            point, square = search_block(store, block, x, y, z, point, square)
-        block = int(store.next_block[block])
-    return point, square
+            slot = find(store.table, key)
+            for candidate in range(store.table[slot, START], store.table[slot, START] + store.table[slot, SIZE]):
+                dx, dy, dz = store.pool[candidate, 0] - x, store.pool[candidate, 1] - y, store.pool[candidate, 2] - z
+                d2 = dx * dx + dy * dy + dz * dz
+                if d2 < square:
+                    place, square = candidate, d2
+        block = store.blocks[block, LINK]
+    return place, square
 
 
 @njit(cache=True, error_model="numpy")
-def nearest(store: Store, voxel: float, x: float, y: float, z: float, reach: float) -> tuple[int, float]:
-    """Return the number of the map point nearest (x, y, z) and its squared distance; -1 if none is within `reach`.
-
-    voxel, reach: metres. First the block of the point and its 26 neighbours, as far as they can beat what is found;
-    only if they leave it open, the cells within reach, from the inside out.
-    """
-    point, square = NONE, reach * reach
-    size = BLOCK_VOXELS * voxel
-    bi, bj, bk = math.floor(x / size), math.floor(y / size), math.floor(z / size)
-    block = find(store.block_keys, store.block_values, pack(bi, bj, bk))
-    if block != NONE:
-        point, square = search_block(store, block, x, y, z, point, square)
-    for i in range(bi - 1, bi + 2):
-        dx = gap(i, size, x)
-        if dx * dx >= square:
-            continue
-        for j in range(bj - 1, bj + 2):
-            dy = gap(j, size, y)
-            if dx * dx + dy * dy >= square:
-                continue
-            for k in range(bk - 1, bk + 2):
-                dz = gap(k, size, z)
-                if dx * dx + dy * dy + dz * dz >= square or (i == bi and j == bj and k == bk):
-                    continue
-                block = find(store.block_keys, store.block_values, pack(i, j, k))
-                if block != NONE:
-                    point, square = search_block(store, block, x, y, z, point, square)
-    if square <= size * size:  # the 27 blocks reach at least one block's size in every direction
-        return point, square
-    return nearest_by_cell(store, size, x, y, z, point, square)
-
-
-@njit(cache=True, error_model="numpy")
-def nearest_by_cell(
-    store: Store, size: float, x: float, y: float, z: float, point: int, square: float
+def search_cells(
+    store: Store, edge: float, x: float, y: float, z: float, place: int, square: float
 ) -> tuple[int, float]:
-    """Go on with the search of `nearest` (blocks of `size` metres), shell by shell of cells."""
-    edge = CELL_BLOCKS * size
-    ci, cj, ck = math.floor(x / edge), math.floor(y / edge), math.floor(z / edge)
-    for shell in range(int(math.sqrt(square) / edge) + 2):
-        inner = (shell - 1) * edge  # every cell of the shell is farther than this
+    """Return place and squared distance of the nearest so far, after all cells within it, shell by shell."""
+    width = CELL_BLOCKS * edge
+    ci, cj, ck = voxel_of(x, y, z, width)
+    for shell in range(int(math.sqrt(square) / width) + 2):
+        inner = (shell - 1) * width  # every cell of the shell is farther than this
         if shell > 0 and inner * inner >= square:
             break
         for i in range(ci - shell, ci + shell + 1):
-            dx = gap(i, edge, x)
+            dx = gap(i, width, x)
             for j in range(cj - shell, cj + shell + 1):
-                dy = gap(j, edge, y)
+                dy = gap(j, width, y)
                 if dx * dx + dy * dy >= square:
                     continue
                 whole = abs(i - ci) == shell or abs(j - cj) == shell
                 for k in range(ck - shell, ck + shell + 1, 1 if whole or shell == 0 else 2 * shell):
-                    dz = gap(k, edge, z)
+                    dz = gap(k, width, z)
                     if dx * dx + dy * dy + dz * dz >= square:
                         continue
-                    cell = find(store.cell_keys, store.cell_values, pack(i, j, k))
-                    if cell != NONE:
-                        point, square = search_cell(store, cell, size, x, y, z, point, square)
-    return point, square
+                    cell = find(store.cells, pack(i, j, k))
+                    if store.cells[cell, KEY] != NONE:
+                        place, square = search_cell(store, cell, edge, x, y, z, place, square)
+    return place, square
 
 
 @njit(cache=True, error_model="numpy")
-def nearest_all(
-    store: Store, voxel: float, points: Floats, reach: float
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64]]:
-    """Return, for each of the points (n, 3), the nearest map point (-1 beyond reach) and its squared distance (n,)."""
-    found = np.empty(len(points), np.int32)
-    squares = np.empty(len(points), np.float64)
+def nearest(store: Store, voxel: float, points: Floats | Doubles, reach: float) -> tuple[Ints, Doubles]:
+    """Return, for each of the points (n, 3), the nearest map point (-1 beyond reach) and its squared distance (n,).
+
+    voxel, reach: metres. First the 27 voxels around the point; if they leave it open the 27 blocks; then the cells
+    within reach, from the inside out. Points that are not finite have no neighbour.
+    """
+    edge = BLOCK_VOXELS * voxel
+    table, pool = store.table, store.pool
+    found = np.full(len(points), NONE, np.int32)
+    squares = np.full(len(points), np.inf)
     for n in range(len(points)):
         x, y, z = float(points[n, 0]), float(points[n, 1]), float(points[n, 2])
         if not (abs(x) < np.inf and abs(y) < np.inf and abs(z) < np.inf):
-            found[n], squares[n] = NONE, np.inf
             continue
-        found[n], squares[n] = nearest(store, voxel, x, y, z, reach)
+        place, square = search_voxels(table, pool, voxel, x, y, z, reach)
+        if square > voxel * voxel:  # else the 27 voxels, which reach so far in every direction, have settled it
+            place, square = search_blocks(table, pool, edge, x, y, z, place, square)
+            if square > edge * edge:
+                place, square = search_cells(store, edge, x, y, z, place, square)
+        if place != NONE:
+            found[n], squares[n] = store.pool_number[place, 3], square
     return found, squares

@@ -111,18 +111,18 @@ def estimate_normals(
         low = max(0, int((t - radius - bins.lowest) / bins.height))
         high = min(bins.rows - 1, int((t + radius - bins.lowest) / bins.height))
         centre = min(bins.columns - 1, int((f + math.pi) / bins.width))
+        left, right = centre - spread, centre + spread
         near = 0
         mx, my, mz = 0.0, 0.0, 0.0
         xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for row in range(low, high + 1):
-            left, right = centre - spread, centre + spread
-            # A range of columns that crosses the seam is read in two parts, with the azimuth shifted by one turn.
-            for part in range(3):
-                shift = (part - 1) * bins.columns
-                a, b = max(0, left + shift), min(bins.columns - 1, right + shift)
-                if a > b:
-                    continue
-                g = f + (part - 1) * 2.0 * math.pi
+            # Columns beyond the seam of the azimuth are read at its other side, one turn away.
+            for part in range(2 if left < 0 or right >= bins.columns else 1):
+                a, b, g = max(0, left), min(bins.columns - 1, right), f
+                if part == 1 and left < 0:
+                    a, b, g = left + bins.columns, bins.columns - 1, f + 2.0 * math.pi
+                elif part == 1:
+                    a, b, g = 0, right - bins.columns, f - 2.0 * math.pi
                 for j in range(bins.first[row * bins.columns + a], bins.first[row * bins.columns + b + 1]):
                     dt = stheta[j] - t
                     df = AZIMUTH_SCALE * (sphi[j] - g)

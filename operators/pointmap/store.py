@@ -1,7 +1,9 @@
-"""The memory of a voxel map: points chained by block of 4 x 4 x 4 voxels, blocks by cell of 8 x 8 x 8 blocks.
+"""The memory of a voxel map: voxels in blocks of 4 x 4 x 4, blocks in cells of 8 x 8 x 8.
 
-A block answers 'is this voxel taken?' with one bit of a 64-bit mask, so that one look-up in a hash table serves 64
-voxels; a cell lets a search step over a cubic metre of emptiness at once. All is plain arrays, for numba.
+One look-up in a hash table finds a block and with it 64 voxels: a mask of 64 bits says which are taken, and the points
+of a block lie side by side in a pool, in the order of their voxels, so that the mask also says where. A cell chains its
+blocks, so that a search steps over a cubic metre of emptiness at once. A search waits for memory and hardly ever
+computes: so what is read together lies together, in rows.
 """
 
 from __future__ import annotations
@@ -22,83 +24,116 @@ Longs = npt.NDArray[np.int64]
 NONE = -1
 BLOCK_BITS, CELL_BITS = 2, 3  # a block has 4 voxels an edge, a cell 8 blocks
 BLOCK_VOXELS, CELL_BLOCKS = 1 << BLOCK_BITS, 1 << CELL_BITS
+LEAST_ROOM = 8  # points for which a new block has room in the pool
 FARTHEST = 1 << 20  # voxel coordinates that fit the packed keys
+
+KEY, START, SIZE, MASK = 0, 1, 2, 3  # columns of the table of blocks: START, SIZE of the points in the pool
+HEAD = 1  # column of the table of cells: its first block
+LINK = 1  # column of the blocks: the next block of the same cell
+NORMAL, SCORE = 3, 6  # first columns of `rows` after the coordinates
 
 
 class Store(NamedTuple):
-    """The arrays of a voxel map; capacities are longer than the counts in `counts`."""
+    """The arrays of a voxel map; all are longer than what is in them, which `counts` tells."""
 
-    points: Floats  # (capacity, 3) metres
-    normals: Floats  # (capacity, 3)
-    scores: Floats  # (capacity,) of the normals
-    created: Ints  # (capacity,) frame that brought the point, -1 from the initial map
-    local: npt.NDArray[np.uint8]  # (capacity,) number of its voxel within the block
-    next_point: Ints  # (capacity,) next point of the same block
-    block_mask: npt.NDArray[np.uint64]  # (blocks,) taken voxels
-    block_head: Ints  # (blocks,) first point
-    block_place: Ints  # (blocks, 3) block coordinates
-    next_block: Ints  # (blocks,) next block of the same cell
-    block_keys: Longs  # open addressing: key, or -1
-    block_values: Ints
-    cell_head: Ints  # (cells,) first block
-    cell_keys: Longs
-    cell_values: Ints
-    counts: Longs  # (3,) points, blocks, cells
+    rows: Floats  # (points, 8) x y z, nx ny nz, score of the normal, unused
+    created: Ints  # (points,) frame that brought the point, -1 from the initial map
+    pool: Floats  # (places, 4) x y z once more, block by block, voxel by voxel
+    pool_number: Ints  # (places, 4) the same memory as `pool`; column 3 is the number of the point
+    table: Longs  # (slots, 4) open addressing: KEY of a block or -1, START, SIZE, MASK of the taken voxels
+    blocks: Longs  # (blocks, 2) KEY, LINK
+    cells: Longs  # (slots, 2) open addressing: KEY of a cell or -1, HEAD
+    counts: Longs  # (4,) points, places, blocks, cells
 
 
 @njit(cache=True)
-def find(keys: Longs, values: Ints, key: int) -> int:
-    """Return the value of a key, or -1."""
-    mask = len(keys) - 1
+def find(table: Longs, key: int) -> int:
+    """Return the slot of a key in an open addressing table (slots, k), or the free slot where it belongs."""
+    mask = len(table) - 1
     slot = spread(key, mask)
-    while keys[slot] != key:
-        if keys[slot] == NONE:
-            return NONE
+    while table[slot, KEY] != key and table[slot, KEY] != NONE:
         slot = (slot + 1) & mask
-    return int(values[slot])
+    return slot
 
 
 @njit(cache=True)
-def put(keys: Longs, values: Ints, key: int, value: int) -> None:
-    """Enter a key that is not there yet."""
-    mask = len(keys) - 1
-    slot = spread(key, mask)
-    while keys[slot] != NONE:
-        slot = (slot + 1) & mask
-    keys[slot] = key
-    values[slot] = value
-
-
-@njit(cache=True)
-def rehash(keys: Longs, values: Ints, slots: int) -> tuple[Longs, Ints]:
+def rehash(table: Longs, slots: int) -> Longs:
     """Return a larger table (slots: a power of two) with the same entries."""
-    new_keys = np.full(slots, NONE, np.int64)
-    new_values = np.empty(slots, np.int32)
-    for slot in range(len(keys)):
-        if keys[slot] != NONE:
-            put(new_keys, new_values, keys[slot], values[slot])
-    return new_keys, new_values
+    larger = np.full((slots, table.shape[1]), NONE, np.int64)
+    for old in range(len(table)):
+        if table[old, KEY] != NONE:
+            new = find(larger, table[old, KEY])
+            for column in range(table.shape[1]):
+                larger[new, column] = table[old, column]
+    return larger
 
 
 @njit(cache=True)
-def make_block(store: Store, i: int, j: int, k: int) -> int:
-    """Open the block at block coordinates (i, j, k), and its cell if that is new. Returns its number."""
-    block = store.counts[1]
-    store.counts[1] += 1
-    put(store.block_keys, store.block_values, pack(i, j, k), block)
-    store.block_mask[block] = np.uint64(0)
-    store.block_head[block] = NONE
-    store.block_place[block, 0], store.block_place[block, 1], store.block_place[block, 2] = i, j, k
+def open_block(store: Store, slot: int, i: int, j: int, k: int) -> None:
+    """Open the block at block coordinates (i, j, k) in its free slot, and its cell if that is new."""
+    block = store.counts[2]
+    store.counts[2] += 1
+    store.table[slot, KEY] = pack(i, j, k)
+    store.table[slot, START] = 0
+    store.table[slot, SIZE] = 0
+    store.table[slot, MASK] = 0
     key = pack(i >> CELL_BITS, j >> CELL_BITS, k >> CELL_BITS)
-    cell = find(store.cell_keys, store.cell_values, key)
-    if cell == NONE:
-        cell = store.counts[2]
-        store.counts[2] += 1
-        put(store.cell_keys, store.cell_values, key, cell)
-        store.cell_head[cell] = NONE
-    store.next_block[block] = store.cell_head[cell]
-    store.cell_head[cell] = block
-    return block
+    cell = find(store.cells, key)
+    if store.cells[cell, KEY] == NONE:
+        store.cells[cell, KEY] = key
+        store.cells[cell, HEAD] = NONE
+        store.counts[3] += 1
+    store.blocks[block, KEY] = pack(i, j, k)
+    store.blocks[block, LINK] = store.cells[cell, HEAD]
+    store.cells[cell, HEAD] = block
+
+
+@njit(cache=True)
+def make_room(store: Store, slot: int) -> None:
+    """Give a block that is full twice its room, at the end of the pool: for 8, 16, 32, 64 points."""
+    size = store.table[slot, SIZE]
+    if size != 0 and (size < LEAST_ROOM or size & (size - 1) != 0):
+        return
+    old, new = store.table[slot, START], store.counts[1]
+    store.counts[1] += max(LEAST_ROOM, 2 * size)
+    store.table[slot, START] = new
+    for n in range(size):
+        for column in range(4):  # as integers: a number may look like a NaN that a register would change
+            store.pool_number[new + n, column] = store.pool_number[old + n, column]
+
+
+@njit(cache=True)
+def voxel_of(x: float, y: float, z: float, size: float) -> tuple[int, int, int]:
+    """Return the coordinates of the voxel of `size` metres that holds a point."""
+    return math.floor(x / size), math.floor(y / size), math.floor(z / size)
+
+
+@njit(cache=True)
+def ones_below(mask: int, local: int) -> int:
+    """Count the bits set below bit `local` of a mask of 64; compiles to one instruction."""
+    bits = np.uint64(mask) & ((np.uint64(1) << np.uint64(local)) - np.uint64(1))
+    bits = bits - ((bits >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    bits = (bits & np.uint64(0x3333333333333333)) + ((bits >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    bits = (bits + (bits >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return int((bits * np.uint64(0x0101010101010101)) >> np.uint64(56))
+
+
+@njit(cache=True)
+def local_of(i: int, j: int, k: int) -> int:
+    """Return the number of voxel (i, j, k) within its block."""
+    return (i & 3) | ((j & 3) << 2) | ((k & 3) << 4)
+
+
+@njit(cache=True)
+def place_in(store: Store, slot: int, place: int, x: float, y: float, z: float, point: int) -> None:
+    """Put a point into the pool of a block at a place; what is there and behind moves up by one."""
+    last = store.table[slot, START] + store.table[slot, SIZE]
+    for n in range(last, place, -1):
+        for column in range(4):
+            store.pool_number[n, column] = store.pool_number[n - 1, column]
+    store.pool[place, 0], store.pool[place, 1], store.pool[place, 2] = x, y, z
+    store.pool_number[place, 3] = point
+    store.table[slot, SIZE] += 1
 
 
 @njit(cache=True, error_model="numpy")
@@ -110,80 +145,77 @@ def insert(store: Store, points: Floats, normals: Floats, scores: Floats, create
     """
     before = store.counts[0]
     for n in range(len(points)):
-        u, v, w = points[n, 0] / size, points[n, 1] / size, points[n, 2] / size
-        if not (abs(u) < FARTHEST and abs(v) < FARTHEST and abs(w) < FARTHEST):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        if not (abs(x) < FARTHEST * size and abs(y) < FARTHEST * size and abs(z) < FARTHEST * size):
             continue
-        i, j, k = math.floor(u), math.floor(v), math.floor(w)
-        bi, bj, bk = i >> BLOCK_BITS, j >> BLOCK_BITS, k >> BLOCK_BITS
-        local = (i & 3) | ((j & 3) << 2) | ((k & 3) << 4)
-        bit = np.uint64(1) << np.uint64(local)
-        block = find(store.block_keys, store.block_values, pack(bi, bj, bk))
-        if block == NONE:
-            block = make_block(store, bi, bj, bk)
-        if store.block_mask[block] & bit:
-            point = store.block_head[block]
-            while store.local[point] != local:
-                point = store.next_point[point]
-            if scores[n] > store.scores[point]:
-                for axis in range(3):
-                    store.normals[point, axis] = normals[n, axis]
-                store.scores[point] = scores[n]
-            continue
-        point = store.counts[0]
-        store.counts[0] += 1
+        i, j, k = voxel_of(x, y, z, size)
+        a, b, c = i >> BLOCK_BITS, j >> BLOCK_BITS, k >> BLOCK_BITS
+        slot = find(store.table, pack(a, b, c))
+        if store.table[slot, KEY] == NONE:
+            open_block(store, slot, a, b, c)
+        local = local_of(i, j, k)
+        taken = (store.table[slot, MASK] >> local) & 1
+        if not taken:
+            make_room(store, slot)
+        place = store.table[slot, START] + ones_below(store.table[slot, MASK], local)
+        if taken:
+            point = int(store.pool_number[place, 3])
+            if not scores[n] > store.rows[point, SCORE]:
+                continue
+        else:
+            point = int(store.counts[0])
+            store.counts[0] += 1
+            place_in(store, slot, place, x, y, z, point)
+            store.table[slot, MASK] |= 1 << local
+            store.rows[point, 0], store.rows[point, 1], store.rows[point, 2] = x, y, z
+            store.created[point] = created
         for axis in range(3):
-            store.points[point, axis] = points[n, axis]
-            store.normals[point, axis] = normals[n, axis]
-        store.scores[point] = scores[n]
-        store.created[point] = created
-        store.local[point] = local
-        store.next_point[point] = store.block_head[block]
-        store.block_head[block] = point
-        store.block_mask[block] |= bit
+            store.rows[point, NORMAL + axis] = normals[n, axis]
+        store.rows[point, SCORE] = scores[n]
     return store.counts[0] - before
+
+
+def empty_store() -> Store:
+    """Return a store without points."""
+    pool = np.empty((1024, 4), np.float32)
+    return Store(
+        rows=np.empty((1024, 8), np.float32),
+        created=np.empty(1024, np.int32),
+        pool=pool,
+        pool_number=pool.view(np.int32),
+        table=np.full((1024, 4), NONE, np.int64),
+        blocks=np.empty((1024, 2), np.int64),
+        cells=np.full((1024, 2), NONE, np.int64),
+        counts=np.zeros(4, np.int64),
+    )
 
 
 def grown(array: npt.NDArray[Any], length: int) -> npt.NDArray[Any]:
     """Return the array with at least `length` rows, doubling; old rows are kept."""
     if len(array) >= length:
         return array
-    larger = np.empty((max(length, 2 * len(array)), *array.shape[1:]), array.dtype)
+    larger = np.zeros((max(length, 2 * len(array)), *array.shape[1:]), array.dtype)
     larger[: len(array)] = array
     return larger
 
 
-def empty_store() -> Store:
-    """Return a store without points."""
-    slots = 1 << 10
-    return Store(
-        points=np.empty((slots, 3), np.float32),
-        normals=np.empty((slots, 3), np.float32),
-        scores=np.empty(slots, np.float32),
-        created=np.empty(slots, np.int32),
-        local=np.empty(slots, np.uint8),
-        next_point=np.empty(slots, np.int32),
-        block_mask=np.empty(slots, np.uint64),
-        block_head=np.empty(slots, np.int32),
-        block_place=np.empty((slots, 3), np.int32),
-        next_block=np.empty(slots, np.int32),
-        block_keys=np.full(slots, NONE, np.int64),
-        block_values=np.empty(slots, np.int32),
-        cell_head=np.empty(slots, np.int32),
-        cell_keys=np.full(slots, NONE, np.int64),
-        cell_values=np.empty(slots, np.int32),
-        counts=np.zeros(3, np.int64),
-    )
+def roomier(table: Longs, entries: int) -> Longs:
+    """Return an open addressing table that so many entries fill by half at most."""
+    return table if 2 * entries <= len(table) else rehash(table, 1 << (2 * entries - 1).bit_length())
 
 
 def with_room(store: Store, more: int) -> Store:
-    """Return the store with room for so many more points, each perhaps in a new block and cell."""
-    points, blocks, cells = (int(count) + more for count in store.counts)
-    changes: dict[str, Any] = {name: grown(getattr(store, name), points) for name in Store._fields[:6]}
-    changes |= {name: grown(getattr(store, name), blocks) for name in Store._fields[6:10]}
-    changes["cell_head"] = grown(store.cell_head, cells)
-    for kind, wanted in (("block", blocks), ("cell", cells)):
-        keys, values = getattr(store, f"{kind}_keys"), getattr(store, f"{kind}_values")
-        if 2 * wanted > len(keys):
-            slots = 1 << (2 * wanted - 1).bit_length()
-            changes[f"{kind}_keys"], changes[f"{kind}_values"] = rehash(keys, values, max(slots, 2 * len(keys)))
-    return store._replace(**changes)
+    """Return the store with room for so many more points, wherever they fall."""
+    points, places, blocks, cells = (int(count) + more for count in store.counts)
+    # One point may open a block (8 places); to move a block of 8, 16 or 32 it takes as many points as it had.
+    pool = grown(store.pool, places + (LEAST_ROOM - 1) * more)
+    return Store(
+        rows=grown(store.rows, points),
+        created=grown(store.created, points),
+        pool=pool,
+        pool_number=pool.view(np.int32),
+        table=roomier(store.table, blocks),
+        blocks=grown(store.blocks, blocks),
+        cells=roomier(store.cells, cells),
+        counts=store.counts,
+    )

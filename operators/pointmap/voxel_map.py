@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from operators.pointmap.nearest import nearest_all
-from operators.pointmap.store import BLOCK_VOXELS, CELL_BLOCKS, NONE, empty_store, insert, with_room
+from operators.pointmap.nearest import nearest
+from operators.pointmap.store import BLOCK_VOXELS, CELL_BLOCKS, NORMAL, SCORE, empty_store, insert, with_room
 
 Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]
 
+CHUNK = 16_384  # points inserted at once
 INITIAL = -1  # frame number of the points of an initial map
 
 
@@ -47,17 +48,17 @@ class VoxelMap:
     @property
     def points(self) -> Floats:
         """Return the points (n, 3), metres, world; a view, older points first."""
-        return self.store.points[: len(self)]
+        return self.store.rows[: len(self), :3]
 
     @property
     def normals(self) -> Floats:
         """Return the normals (n, 3); a view."""
-        return self.store.normals[: len(self)]
+        return self.store.rows[: len(self), NORMAL : NORMAL + 3]
 
     @property
     def scores(self) -> Floats:
         """Return the scores of the normals (n,); a view."""
-        return self.store.scores[: len(self)]
+        return self.store.rows[: len(self), SCORE]
 
     @property
     def created(self) -> Ints:
@@ -66,8 +67,12 @@ class VoxelMap:
 
     def insert(self, points: Floats, normals: Floats, scores: Floats, frame: int) -> int:
         """Add points (n, 3) in world coordinates with normals (n, 3) and scores (n,); returns how many are new."""
-        self.store = with_room(self.store, len(points))
-        return int(insert(self.store, points, normals, scores, frame, self.voxel_size))
+        before = len(self)
+        for first in range(0, len(points), CHUNK):  # room is made for the worst case: small steps keep that small
+            part = slice(first, first + CHUNK)
+            self.store = with_room(self.store, len(points[part]))
+            insert(self.store, points[part], normals[part], scores[part], frame, self.voxel_size)
+        return len(self) - before
 
     def insert_map(self, cloud: MapPoints) -> int:
         """Add the points of an initial map, neighbours in space as neighbours in memory; returns how many are kept."""
@@ -78,8 +83,8 @@ class VoxelMap:
 
     def nearest(self, points: Floats, reach: float = 2.0) -> tuple[Ints, npt.NDArray[np.float64]]:
         """Return the map point nearest each of the points (n, 3), -1 beyond `reach` metres, and its distance (n,)."""
-        found, squares = nearest_all(self.store, self.voxel_size, np.ascontiguousarray(points, np.float32), reach)
-        return found, np.where(found == NONE, np.inf, np.sqrt(squares))
+        found, squares = nearest(self.store, self.voxel_size, np.ascontiguousarray(points, np.float32), reach)
+        return found, np.sqrt(squares)
 
     def cloud(self, **more: Any) -> MapPoints:
         """Copy the map; `more` may give `movable` and `label`."""

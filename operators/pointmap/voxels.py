@@ -20,6 +20,13 @@ def pack(i: int, j: int, k: int) -> int:
 
 
 @njit(cache=True)
+def unpack(key: int) -> tuple[int, int, int]:
+    """Return the voxel coordinates of a key."""
+    field = (1 << 21) - 1
+    return (key >> 42) - OFFSET, ((key >> 21) & field) - OFFSET, (key & field) - OFFSET
+
+
+@njit(cache=True)
 def spread(key: int, mask: int) -> int:
     """Return the home slot of a key in an open addressing table of mask + 1 (a power of two) slots."""
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)  # Fibonacci hashing: the high bits are the good ones
