@@ -64,8 +64,7 @@ def aligned_copy(raw: memoryview | bytes, dtype: np.dtype[Any], shape: tuple[int
         raise ValueError(f"{len(raw)} bytes do not make a {dtype.name} array of shape {shape}, which takes {size}")
     buffer = np.empty(size + ALIGNMENT, np.uint8)
     start = -buffer.ctypes.data % ALIGNMENT
-    window = buffer[start : start + size]
-    window[:] = np.frombuffer(raw, np.uint8)
-    result = window.view(dtype).reshape(shape)
+    buffer.data[start : start + size] = raw
+    result = np.ndarray(shape, dtype, buffer, start)
     result.flags.writeable = False
     return result

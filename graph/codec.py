@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import json
+import struct
 import typing
 from collections.abc import Callable
 from typing import Any
@@ -21,38 +22,75 @@ ARRAY_EXTENSION = 1  # the only msgpack extension code in use
 
 _ALLOWED_KINDS = "biufc"
 
+_LARGE = 1 << 16  # bytes of an array that is worth a place holder; from here on msgpack's header is always ext 32
+_EXT_32 = struct.Struct(">BIb")  # 0xc9, length, code
+_PLACE = msgspec.msgpack.Ext(ARRAY_EXTENSION, bytes.fromhex("8b5e1f0c6a7d4392b1e0c95d27f3a864"))  # arbitrary bytes
+_PLACE_BYTES = msgspec.msgpack.encode(_PLACE)
+
 
 class CodecError(ValueError):
     """A message that does not fit its type, or bytes that are no such message."""
 
 
+def _array_pieces(value: Array) -> tuple[bytes, memoryview]:
+    """Return the content of an array's extension: what it is, and its bytes as they lie in memory."""
+    if value.dtype.kind not in _ALLOWED_KINDS:
+        raise CodecError(f"arrays of dtype {value.dtype} cannot travel; use numbers or booleans")
+    little = value.dtype.newbyteorder("<")
+    contiguous = np.ascontiguousarray(value, dtype=little)
+    head = msgspec.msgpack.encode((little.str, value.shape))
+    return bytes((len(head),)) + head, contiguous.reshape(-1).view(np.uint8).data
+
+
 def _pack_array(value: Any) -> Any:
     if isinstance(value, np.ndarray):
-        if value.dtype.kind not in _ALLOWED_KINDS:
-            raise CodecError(f"arrays of dtype {value.dtype} cannot travel; use numbers or booleans")
-        little = value.dtype.newbyteorder("<")
-        contiguous = np.ascontiguousarray(value, dtype=little)
-        head = msgspec.msgpack.encode((little.str, value.shape))
-        return msgspec.msgpack.Ext(
-            ARRAY_EXTENSION, b"".join((bytes((len(head),)), head, contiguous.reshape(-1).view(np.uint8).data))
-        )
+        return msgspec.msgpack.Ext(ARRAY_EXTENSION, b"".join(_array_pieces(value)))
     if isinstance(value, np.generic):
         return value.item()
     raise CodecError(f"a {type(value).__name__} cannot travel in a message")
+
+
+def _encode(message: msgspec.Struct) -> bytes:
+    """Encode a message, copying large arrays once instead of three times; the bytes are the same."""
+    large: list[tuple[bytes, memoryview]] = []
+
+    def pack(value: Any) -> Any:
+        if isinstance(value, np.ndarray) and value.nbytes >= _LARGE:
+            large.append(_array_pieces(value))
+            return _PLACE
+        return _pack_array(value)
+
+    encoded = msgspec.msgpack.encode(message, enc_hook=pack)
+    if not large:
+        return encoded
+    between = encoded.split(_PLACE_BYTES)
+    if len(between) != len(large) + 1:  # the message happens to hold the bytes of a place holder
+        return msgspec.msgpack.encode(message, enc_hook=_pack_array)
+    pieces: list[bytes | memoryview] = [between[0]]
+    for (head, data), rest in zip(large, between[1:], strict=True):
+        pieces += (_EXT_32.pack(0xC9, len(head) + len(data), ARRAY_EXTENSION), head, data, rest)
+    return b"".join(pieces)
+
+
+_array_head = msgspec.msgpack.Decoder(tuple[str, tuple[int, ...]])
+
+
+@functools.lru_cache(maxsize=1024)  # most arrays of a topic look alike
+def _array_form(head: bytes) -> tuple[np.dtype[Any], tuple[int, ...]]:
+    name, shape = _array_head.decode(head)
+    dtype = np.dtype(name)
+    if dtype.kind not in _ALLOWED_KINDS:
+        raise CodecError(f"arrays of dtype {dtype} cannot travel")
+    return dtype, shape
 
 
 def _unpack_array(code: int, data: memoryview) -> Array:
     if code != ARRAY_EXTENSION:
         raise CodecError(f"unknown msgpack extension {code}")
     split = 1 + data[0]
-    dtype_name, shape = msgspec.msgpack.decode(data[1:split], type=tuple[str, tuple[int, ...]])
-    dtype = np.dtype(dtype_name)
-    if dtype.kind not in _ALLOWED_KINDS:
-        raise CodecError(f"arrays of dtype {dtype} cannot travel")
+    dtype, shape = _array_form(bytes(data[1:split]))
     return aligned_copy(data[split:], dtype, shape)
 
-
-_encoder = msgspec.msgpack.Encoder(enc_hook=_pack_array)
 
 Check = Callable[[Any, dict[str, int], str], None]
 
@@ -123,7 +161,7 @@ def encode(message: msgspec.Struct) -> bytes:
     """Encode a message. Raises CodecError, naming the field, if an array is not of the declared dtype and shape."""
     try:
         _check_struct(message, {}, type(message).__name__)
-        return _encoder.encode(message)
+        return _encode(message)
     except (TypeError, msgspec.MsgspecError) as error:
         raise CodecError(f"{type(message).__name__}: {error}") from error
 
