@@ -11,7 +11,7 @@ from pathlib import Path
 from graph.errors import UserError
 from graph.graphfile import Graph
 from graph.ledger import INFINITY, Mark, Step
-from graph.lockstep import EndlessError, Lockstep
+from graph.lockstep import Lockstep, endless
 from graph.merge import merge
 from graph.node import STREAM, Emission, Node, build_operator
 from graph.realtime import Realtime
@@ -77,8 +77,6 @@ class Local:
             schedule.finished = self.done = True
             self.write(step)
             return True
-        if isinstance(schedule, Lockstep) and schedule.stranded():
-            raise EndlessError(self.spec.name)
         return False
 
     def mark(self) -> Mark | None:
@@ -126,6 +124,8 @@ def launch_in_process(
             for item in turn:
                 busy |= item.advance()
                 busy |= _spread(item, locals_)
+            if all(item.schedule.dormant() for item in locals_ if isinstance(item.schedule, Lockstep)):
+                raise UserError(endless(graph.clock.end))
             progress(max(item.schedule.handled for item in locals_) / 1e9)
             if not busy:
                 raise RuntimeError("deadlock: no operator can go on; this is a bug of the runtime")

@@ -19,6 +19,7 @@ from typing import IO, Any
 import msgspec
 
 from graph.graphfile import Graph
+from graph.lockstep import endless
 from graph.merge import merge
 from graph.recording import Verdict
 from graph.run import Paths, describe
@@ -250,6 +251,15 @@ class Launcher:
                 if ended or (duration is not None and time.monotonic_ns() - self.origin > duration):
                     self._stop()
                     return
+            elif self._dormant():
+                self.reasons.append(endless(self.graph.clock.end))
+                self._stop()
+                return
+
+    def _dormant(self) -> bool:
+        """Say whether a lockstep run has come to rest without an end: nobody has anything to do, and nothing is under way."""
+        states = [self.states.get(name) for name in self._working()]
+        return all(state is not None and state.dormant for state in states) and self._settled()
 
     def _stop(self) -> None:
         """Stop timers and sources, and let what is under way come to rest within DRAIN seconds."""
@@ -289,17 +299,19 @@ class Launcher:
         """Say whether a stopped realtime run has nothing under way: all idle, and every edge's counts agree."""
         if any(self._phase(name) not in ("idle", "finished") for name in self._working()):
             return False
-        restarted = any(child.incarnation for child in self.children.values())
-        for spec in self.specs:
-            if spec.kind == "sink":
-                continue
-            for edge in spec.inputs:
-                if edge.period is not None:
-                    continue
-                put = self.states[edge.producer].counts[edge.index]
-                if not restarted and self.states[spec.name].received.get(edge.topic, 0) != put:
-                    return False
-        return not restarted or time.monotonic() - self.news_at > SILENCE
+        if any(child.incarnation for child in self.children.values()):
+            return time.monotonic() - self.news_at > SILENCE
+        return self._settled()
+
+    def _settled(self) -> bool:
+        """Say whether every operator has received what the others say they have put; sinks aside."""
+        return all(
+            self.states[spec.name].received.get(edge.topic, 0) == self.states[edge.producer].counts[edge.index]
+            for spec in self.specs
+            if spec.kind != "sink"
+            for edge in spec.inputs
+            if edge.period is None
+        )
 
     def _finish(self) -> None:
         """Let every process go: only now, since others may have been reading their memory."""

@@ -19,11 +19,9 @@ class GapError(RuntimeError):
     """A message that was announced never came."""
 
 
-class EndlessError(RuntimeError):
-    """The operator that is to end the run can never say so."""
-
-    def __init__(self, name: str) -> None:
-        super().__init__(f"clock.end names {name}; all that {name} listens to has ended, and it has not said End")
+def endless(name: str | None) -> str:
+    """Say in a sentence that the operator which is to end the run will never be called again."""
+    return f"clock.end names {name}; nothing is left to do, and it has not said End"
 
 
 class Arrival(NamedTuple):
@@ -178,10 +176,9 @@ class Lockstep:
         self.promised = watermark
         return Mark(watermark, counts, self.end if self.spec.end == self.spec.name and self.end < INFINITY else None)
 
-    def stranded(self) -> bool:
-        """Say whether this operator is to end the run, has not said End, and will never be called again."""
-        waiting = self.started and self.spec.end == self.spec.name and self.end == INFINITY
-        return waiting and not self.pending and self.edges_at() >= INFINITY - 1
+    def dormant(self) -> bool:
+        """Say whether only a message from another operator can make this one do something again."""
+        return self.started and self.end == INFINITY and not self.pending and not self.streaming
 
     def gaps(self) -> list[str]:
         """Name the messages that were announced and have not come."""

@@ -18,7 +18,7 @@ import msgspec
 
 from graph.errors import UserError
 from graph.ledger import INFINITY, Mark, Step
-from graph.lockstep import EndlessError, GapError, Lockstep
+from graph.lockstep import GapError, Lockstep
 from graph.memory import keep_pages, spare_garbage_collection
 from graph.node import STREAM, Emission, Node, build_operator
 from graph.realtime import Realtime
@@ -58,7 +58,8 @@ class State(msgspec.Struct):
     steps: int
     durations: tuple[int, ...] = ()  # nanoseconds, of the calls since the last report
     counts: tuple[int, ...] = ()  # messages put, by output port
-    received: dict[str, int] = msgspec.field(default_factory=dict)  # realtime: by topic
+    received: dict[str, int] = msgspec.field(default_factory=dict)  # by topic
+    dormant: bool = False  # lockstep: nothing to do but what others may send
     end: int | None = None  # this operator's End, where it ends the run
     skipped: int = 0
 
@@ -211,8 +212,9 @@ class Worker:
             return
         schedule = self.lockstep or self.realtime
         assert schedule is not None
-        received = self.realtime.received if self.realtime else {}
-        facts = (self.phase, self.node.index, self.own_end, tuple(received.values()))
+        received = schedule.received
+        dormant = self.lockstep is not None and self.lockstep.dormant()
+        facts = (self.phase, self.node.index, self.own_end, dormant, tuple(received.values()))
         if facts == self.reported and not force:
             return
         self.reported, self.report_at = facts, now + STATE_PERIOD
@@ -223,6 +225,7 @@ class Worker:
             tuple(self.durations),
             tuple(self.node.counts.values()),
             received,
+            dormant,
             self.own_end,
             self.skipped,
         )
@@ -274,8 +277,6 @@ class Worker:
                 continue
             if schedule.complete() and self.phase == "running":
                 break
-            if schedule.stranded():
-                raise EndlessError(self.spec.name)
             self.promise()
             self.report()
             waited = time.thread_time()
