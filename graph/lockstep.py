@@ -176,6 +176,11 @@ class Lockstep:
         self.promised = watermark
         return Mark(watermark, counts, self.end if self.spec.end == self.spec.name and self.end < INFINITY else None)
 
+    @property
+    def received(self) -> dict[str, int]:
+        """Return the number of messages that have come of each topic."""
+        return {edge.edge.topic: edge.received for edge in self.edges}
+
     def dormant(self) -> bool:
         """Say whether only a message from another operator can make this one do something again."""
         return self.started and self.end == INFINITY and not self.pending and not self.streaming
