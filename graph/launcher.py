@@ -257,7 +257,7 @@ class Launcher:
                 return
 
     def _dormant(self) -> bool:
-        """Say whether a lockstep run has come to rest without an end: nobody has anything to do, and nothing is under way."""
+        """Say whether a lockstep run has come to rest without an end: nothing to do, and nothing under way."""
         states = [self.states.get(name) for name in self._working()]
         return all(state is not None and state.dormant for state in states) and self._settled()
 

@@ -108,7 +108,7 @@ class Lockstep:
             self.flow[operator] = max(self.flow[operator], watermark)
 
     def offer(self, stamp: int, payload: bytes | None = None) -> None:
-        """Queue the next item of a source's stream; INFINITY says that there are no more, which ends a run that it is to end."""
+        """Queue the next item of a source's stream; INFINITY: there are no more, which ends a run that it is to end."""
         if not self.streaming:
             return  # a person stopped the run
         if stamp >= INFINITY:
@@ -162,7 +162,8 @@ class Lockstep:
             return INFINITY
         if not self.started:
             return -1
-        horizon = min(self.edges_at(), self.end - 1, self.control)  # on_end speaks at the end, which may come after control
+        # on_end speaks at the end, which is not known before the operator that ends the run has passed it
+        horizon = min(self.edges_at(), self.end - 1, self.control)
         if self.pending:
             return min(horizon, self.pending[0].time - 1)
         if self.streaming and self.spec.end == self.spec.name:

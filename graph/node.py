@@ -71,7 +71,7 @@ class Node:
         stamp, self.peeked = int(item[0]), item[1]
         if stamp <= self.last_stamp:
             raise OutputError(
-                f"{self.spec.name}: the stamps of a stream increase strictly from 0; {stamp} ns follows {self.last_stamp} ns"
+                f"{self.spec.name}: stamps of a stream increase strictly from 0; {stamp} ns follows {self.last_stamp} ns"
             )
         self.last_stamp = stamp
         return stamp
