@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import time
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Literal
 
 import msgspec
-import numpy as np
 
-from graph import End, Operator, Sink, Source, Summary
-from graph.messages import PointCloud, Tick
-from tests.sample_operators import Blob, Count, CountOutputs
+from graph import End, Operator, Source
+from graph.messages import Tick
+from tests.sample_operators import Count
 
 MODULUS = 1_000_003
 
