@@ -4,6 +4,9 @@ simulator:
   run: operators.simulator:Simulator
   inputs: {tick: timer/10hz, drive: {from: planner/drive, delay: 100ms}, pose: {from: localizer/pose, delay: 100ms}}
   config: {building: sim/buildings/default.yaml, scenario: easy, tour: A, seed: 1}
+
+The robot is put at the start pose of its tour and knows it: odometry begins at world_from_base of the first tick, so
+that a localizer without a map builds one in the world's frame. Frames are stamped with the end of their scan.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from sim.referee import Referee
 from sim.world import World
 
 SECOND = 1_000_000_000  # nanoseconds
+REMEMBERED = 5 * SECOND  # true poses kept, for estimates still to come
 
 
 class Simulator(Operator):
@@ -33,8 +37,10 @@ class Simulator(Operator):
         scenario: str = "easy"  # name or file
         tour: str = "A"
         seed: int = 0
-        lidar: str = "paper"  # a preset
+        lidar: str = "paper"  # a preset: paper, hdl32e
         rolling: bool = False  # columns one after the other over the scan period
+        dropout: float = 0.0  # share of returns lost at grazing incidence and far away, at most
+        goal_radius: float = 0.9  # metres between the robot's own estimate and a target that it reaches
         patience: float = 5.0  # the tour ends after so many times its free driving time
 
     class Outputs(msgspec.Struct):
@@ -48,82 +54,78 @@ class Simulator(Operator):
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
         c: Simulator.Config = self.config
-        self.world = World(c.building, c.scenario, c.tour, c.seed, lidar=c.lidar, rolling=c.rolling or None)
-        self.referee = Referee(self.world.targets, self.world.layout.way, patience=c.patience)
+        self.world = World(c.building, c.scenario, c.tour, c.seed, lidar=c.lidar, rolling=c.rolling, dropout=c.dropout)
+        self.referee = Referee(self.world.targets, self.world.length, patience=c.patience, radius=c.goal_radius)
         self.command = (0.0, 0.0)
         self.now: int | None = None  # stamp of the last tick
-        self.poses: dict[int, Matrix] = {}  # true world_from_base by stamp, for poses still to come
+        self.poses: dict[int, Matrix] = {}  # true world_from_base by stamp, for estimates still to come
 
     def on_drive(self, drive: Drive) -> None:
         """Obey from the next tick on."""
         self.command = (drive.linear, drive.angular)
 
     def on_pose(self, pose: Pose) -> None:
-        """Judge what the robot believes."""
+        """Judge what the robot believes against the truth of the same moment."""
         true = self.poses.get(pose.measured_at)
         if true is not None:
-            self.referee.judge(pose.measured_at / SECOND, pose.world_from_base, true)
+            self.referee.judge(pose.world_from_base, true)
 
     def on_tick(self, tick: Tick) -> Iterator[Outputs | End]:
-        """Advance by one period, scan, and decide whether the tour goes on."""
-        world = self.world
+        """Advance to the tick, scan, and say whether the tour goes on. Raises ValueError at a tick of another rate."""
+        world, now = self.world, tick.measured_at
         if self.now is not None:
-            world.advance(*self.command, (tick.measured_at - self.now) / SECOND)
-        self.now = tick.measured_at
+            seconds = (now - self.now) / SECOND
+            scans = seconds * world.spec.rate
+            if not np.isclose(scans, max(1, round(scans))):
+                raise ValueError(
+                    f"simulator.tick came after {seconds:g} s; the lidar wants timer/{world.spec.rate:g}hz"
+                )
+            world.advance(*self.command, seconds)
+        self.now = now
         state = world.state()
-        self.poses = {stamp: pose for stamp, pose in self.poses.items() if stamp > self.now - 5 * SECOND}
-        self.poses[self.now] = state.world_from_base
-        verdict = self.referee.watch(self.now / SECOND, state.world_from_base)
-        yield self.Outputs(self.frame(), self.odometry(), self.goal(), self.truth())
+        self.poses = {stamp: pose for stamp, pose in self.poses.items() if stamp > now - REMEMBERED}
+        self.poses[now] = state.world_from_base
+        verdict = self.referee.watch(now / SECOND, state.world_from_base)
+        scan = world.scan()
+        yield self.Outputs(
+            frame=PointCloud(
+                measured_at=now,
+                points=scan.points,
+                base_from_lidar=world.base_from_lidar(),
+                ring=scan.ring,
+                time_offset=scan.time_offset,
+                truth=scan.truth,
+                moving=scan.moving,
+                instance=scan.instance,
+            ),
+            odometry=Odometry(
+                measured_at=now,
+                odom_from_base=state.odom_from_base,
+                linear=state.linear,
+                angular=state.angular,
+                true_world_from_base=state.world_from_base,
+            ),
+            goal=self.goal(now),
+            truth=Truth(
+                measured_at=now,
+                world_from_base=state.world_from_base,
+                people=state.people,
+                people_moving=state.people_moving,
+                people_instance=state.people_instance,
+                contacts=state.contacts,
+            ),
+        )
         if verdict:
             yield End(verdict)
 
-    def frame(self) -> PointCloud:
-        """Scan."""
-        scan = self.world.scan()
-        return PointCloud(
-            measured_at=self.now or 0,
-            points=scan.points,
-            base_from_lidar=self.world.base_from_lidar(),
-            ring=scan.ring,
-            time_offset=scan.time_offset,
-            truth=scan.truth,
-            moving=scan.moving,
-            instance=scan.instance,
-        )
-
-    def odometry(self) -> Odometry:
-        """Read wheels and gyro."""
-        state = self.world.state()
-        return Odometry(
-            measured_at=self.now or 0,
-            odom_from_base=state.odom_from_base,
-            linear=state.linear,
-            angular=state.angular,
-            true_world_from_base=state.world_from_base,
-        )
-
-    def goal(self) -> Goal:
-        """Name the target to reach next."""
-        index = min(self.referee.index, len(self.world.targets) - 1)
-        return Goal(
-            measured_at=self.now or 0, target=self.world.targets[index], index=index, count=len(self.world.targets)
-        )
-
-    def truth(self) -> Truth:
-        """Say what is true."""
-        state = self.world.state()
-        return Truth(
-            measured_at=self.now or 0,
-            world_from_base=state.world_from_base,
-            people=np.asarray(state.people, np.float64),
-            people_moving=state.people_moving,
-            people_instance=state.people_instance,
-            contacts=state.contacts,
-        )
+    def goal(self, now: int) -> Goal:
+        """Name the target to reach next, after the tour the last one."""
+        targets = self.world.targets
+        index = min(self.referee.index, len(targets) - 1)
+        return Goal(measured_at=now, target=targets[index], index=index, count=len(targets))
 
     def on_end(self) -> Summary:
-        """Sum the session up."""
+        """Sum the session up, in numbers."""
         collisions = self.world.collisions
         return Summary(
             **self.referee.summary(),

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import weakref
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from sim.quiet import pybullet as p
+from sim.engines import pybullet as p
 from sim.solids import Body
 
 Array = npt.NDArray[np.float64]
@@ -21,7 +22,10 @@ MASS, WHEEL_MASS = 14.0, 0.8  # kg
 MOTOR = 6.0  # N m, the most a wheel's motor gives
 TOP_SPEED, TOP_TURN = 1.3, 1.0  # m/s, rad/s
 ACCELERATION, TURN_ACCELERATION = 1.0, 2.5  # m/s^2, rad/s^2
+MAST = 0.06, 0.68  # metres: width and top of the column that carries the lidar
 PERSON_REACH = 1.6  # metres from the robot within which people have bodies
+GLIDE = 6  # substeps between two placements of walking people
+BATCH = 16384  # rays that PyBullet takes at once
 
 
 class Motion(NamedTuple):
@@ -38,6 +42,7 @@ class Physics:
 
     def __init__(self, bodies: list[Body], start: tuple[float, float, float]) -> None:
         self.client = p.connect(p.DIRECT)
+        weakref.finalize(self, _disconnect, self.client)
         p.setGravity(0, 0, -9.81, physicsClientId=self.client)
         p.setPhysicsEngineParameter(fixedTimeStep=SUBSTEP, deterministicOverlappingPairs=1, physicsClientId=self.client)
         self.floor = p.createMultiBody(
@@ -50,11 +55,6 @@ class Physics:
         self.people: dict[int, list[int]] = {}  # person: capsule bodies
         self.owner: dict[int, int] = {}  # capsule body: person
         self._settle()
-
-    def close(self) -> None:
-        """Let PyBullet forget this world."""
-        if p.isConnected(self.client):
-            p.disconnect(self.client)
 
     def _still(self, body: Body) -> int:
         triangles = np.concatenate([part.triangles() for part in body.parts])
@@ -70,12 +70,15 @@ class Physics:
     def _robot(self, start: tuple[float, float, float]) -> int:
         """Build chassis, two driven wheels and two casters that slide. Returns PyBullet's number."""
         client = self.client
-        chassis = p.createCollisionShape(
-            p.GEOM_BOX, halfExtents=[LENGTH / 2, WIDTH / 2, HEIGHT / 2], physicsClientId=client
+        middle = GROUND_CLEARANCE + HEIGHT / 2
+        chassis = p.createCollisionShapeArray(
+            shapeTypes=[p.GEOM_BOX, p.GEOM_BOX],
+            halfExtents=[[LENGTH / 2, WIDTH / 2, HEIGHT / 2], [MAST[0] / 2, MAST[0] / 2, (MAST[1] - middle) / 2]],
+            collisionFramePositions=[[0, 0, 0], [0, 0, (MAST[1] - middle) / 2]],
+            physicsClientId=client,
         )
         wheel = p.createCollisionShape(p.GEOM_CYLINDER, radius=WHEEL_RADIUS, height=WHEEL_WIDTH, physicsClientId=client)
         ball = p.createCollisionShape(p.GEOM_SPHERE, radius=0.03, physicsClientId=client)
-        middle = GROUND_CLEARANCE + HEIGHT / 2
         x, y, yaw = start
         sideways = p.getQuaternionFromEuler([math.pi / 2, 0, 0])
         robot = p.createMultiBody(
@@ -153,35 +156,50 @@ class Physics:
         forward = float(np.dot(velocity, pose[:3, 0]))
         return Motion(pose, forward, float(spin[2]), (states[0][0], states[1][0]))
 
-    def place_people(self, capsules: Array, radii: Array, robot: tuple[float, float]) -> None:
-        """Give the people near the robot bodies of capsules: ends (n, parts, 2, 3) and radii (n, parts) in metres."""
+    def place_people(self, capsules: Array, radii: Array, reach: float = PERSON_REACH) -> None:
+        """Give the people within `reach` metres of the robot bodies of capsules, and take away those of the others.
+
+        capsules: ends (n, parts, 2, 3) and radii (n, parts) in metres.
+        """
         if not len(capsules):
             return
-        middle = capsules.mean((1, 2))[:, :2]
-        near = np.hypot(*(middle - robot).T) < PERSON_REACH
-        for person in np.flatnonzero(near):
-            self._place(int(person), capsules[person], radii[person])
+        robot, _ = p.getBasePositionAndOrientation(self.robot, physicsClientId=self.client)
+        middles = capsules[:, :, :, :2].mean((1, 2))
+        near = np.hypot(middles[:, 0] - robot[0], middles[:, 1] - robot[1]) < reach
+        for index in np.flatnonzero(near).tolist():
+            self._place(index, capsules[index], radii[index])
         for person in [person for person in self.people if not near[person]]:
             for body in self.people.pop(person):
                 del self.owner[body]
                 p.removeBody(body, physicsClientId=self.client)
 
     def _place(self, person: int, capsules: Array, radii: Array) -> None:
-        middles = capsules.mean(1)
-        turns = [_turn(ends[1] - ends[0]) for ends in capsules]
-        if person not in self.people:
-            lengths = np.linalg.norm(capsules[:, 1] - capsules[:, 0], axis=1)
-            made = []
-            for middle, turn, length, radius in zip(middles, turns, lengths, radii, strict=True):
-                shape = p.createCollisionShape(
-                    p.GEOM_CAPSULE, radius=float(radius), height=float(length), physicsClientId=self.client
-                )
-                made.append(int(p.createMultiBody(0, shape, -1, middle.tolist(), turn, physicsClientId=self.client)))
-            self.people[person] = made
-            self.owner |= dict.fromkeys(made, person)
+        middles = capsules.mean(1).tolist()
+        axes = capsules[:, 1] - capsules[:, 0]
+        turns = _turns(axes).tolist()
+        if person in self.people:
+            for body, middle, turn in zip(self.people[person], middles, turns, strict=True):
+                p.resetBasePositionAndOrientation(body, middle, turn, physicsClientId=self.client)
             return
-        for body, middle, turn in zip(self.people[person], middles, turns, strict=True):
-            p.resetBasePositionAndOrientation(body, middle.tolist(), turn, physicsClientId=self.client)
+        lengths = np.linalg.norm(axes, axis=1).tolist()
+        made = []
+        for middle, turn, length, radius in zip(middles, turns, lengths, radii.tolist(), strict=True):
+            shape = p.createCollisionShape(p.GEOM_CAPSULE, radius=radius, height=length, physicsClientId=self.client)
+            made.append(int(p.createMultiBody(0, shape, -1, middle, turn, physicsClientId=self.client)))
+        self.people[person] = made
+        self.owner |= dict.fromkeys(made, person)
+
+    def rays(self, origins: Array, ends: Array) -> tuple[Array, npt.NDArray[np.int64]]:
+        """Cast rays (n, 3) to (n, 3), in metres, by PyBullet's rayTestBatch in one thread.
+
+        Returns the share of the way at which each hits (1: nothing) and PyBullet's number of the body (-1: nothing).
+        """
+        share, number = np.ones(len(origins)), np.full(len(origins), -1)
+        for first in range(0, len(origins), BATCH):
+            part = slice(first, first + BATCH)
+            hits = p.rayTestBatch(origins[part], ends[part], numThreads=1, physicsClientId=self.client)
+            number[part], share[part] = [hit[0] for hit in hits], [hit[2] for hit in hits]
+        return share, number
 
     def contacts(self) -> tuple[set[int], set[int]]:
         """Return the bodies that stand still, and the people, that the robot touches."""
@@ -198,13 +216,17 @@ class Physics:
         return still, people
 
 
-def _turn(axis: Array) -> list[float]:
-    """Return the quaternion x, y, z, w that turns +z into an axis."""
-    length = float(np.linalg.norm(axis))
-    if length < 1e-9:
-        return [0.0, 0.0, 0.0, 1.0]
-    x, y, z = axis / length
-    if z < -0.999999:
-        return [1.0, 0.0, 0.0, 0.0]
-    scale = math.sqrt(2.0 * (1.0 + z))
-    return [-y / scale, x / scale, 0.0, scale / 2.0]
+def _disconnect(client: int) -> None:
+    if p.isConnected(client):
+        p.disconnect(client)
+
+
+def _turns(axes: Array) -> Array:
+    """Return the quaternions x, y, z, w (n, 4) that turn +z into axes (n, 3) of any length."""
+    lengths = np.linalg.norm(axes, axis=1, keepdims=True)
+    x, y, z = (np.where(lengths > 1e-9, axes, [0.0, 0.0, 1.0]) / np.maximum(lengths, 1e-9)).T
+    z = np.where(lengths[:, 0] > 1e-9, z, 1.0)
+    scale = np.sqrt(np.maximum(2.0 * (1.0 + z), 1e-12))
+    turns = np.stack([-y / scale, x / scale, np.zeros(len(axes)), scale / 2.0], 1)
+    turns[z < -0.999999] = [1.0, 0.0, 0.0, 0.0]
+    return turns

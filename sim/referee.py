@@ -15,77 +15,86 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-BELIEVED = 0.9  # metres between the robot's own estimate and a target that it reaches
-TRUE = 1.5  # metres that it may be away in truth
+TRUE = 1.5  # metres that the robot may be away from a target that it believes to reach
 SLOW = 0.03  # m/s, mean over
 SLOW_TIME = 15.0  # seconds
 LOST = 2.0  # metres
 FREE_SPEED = 0.8  # m/s at which a free way is driven
 
+FINISHED, STUCK, LOST_WAY, TIME_UP = "tour finished", "stuck", "lost", "time is up"
+ENDINGS = (FINISHED, STUCK, LOST_WAY, TIME_UP)
+
 
 class Referee:
-    """Watches one tour. targets: (n, 2) metres; way: (m, 2) through all of them."""
+    """Watches one tour.
 
-    def __init__(self, targets: Array, way: Array, *, patience: float) -> None:
+    targets: (n, 2) metres. length: of the way through all of them, metres. patience: the tour ends after so many times
+    its free driving time. radius: metres between the robot's own estimate and a target that it reaches.
+    """
+
+    def __init__(self, targets: Array, length: float, *, patience: float = 5.0, radius: float = 0.9) -> None:
         self.targets = targets
-        self.free_length = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
-        self.limit = patience * self.free_length / FREE_SPEED
+        self.limit = patience * length / FREE_SPEED
+        self.radius = radius
         self.index = 0  # of the next target
-        self.reached = 0
         self.errors: list[float] = []
         self.believed: Array | None = None  # (2,) where the robot last said it was
-        self.track: deque[tuple[float, float, float]] = deque()  # time, x, y of the last SLOW_TIME
+        self.track: deque[tuple[float, float]] = deque()  # time, and metres driven until then, of the last SLOW_TIME
+        self.place: Array | None = None
         self.driven = 0.0
         self.time = 0.0
-        self.ending = "under way"
+        self.ending = ""
 
-    def judge(self, time: float, believed: Array, true: Array) -> None:
+    def judge(self, believed: Array, true: Array) -> None:
         """Take the robot's estimate of a pose, and the true one of the same moment; both world_from_base (4, 4)."""
-        self.believed = np.asarray(believed[:2, 3])
-        self.errors.append(float(np.linalg.norm(believed[:2, 3] - true[:2, 3])))
+        self.believed = np.array(believed[:2, 3])
+        self.errors.append(float(np.hypot(*(believed[:2, 3] - true[:2, 3]))))
 
     def watch(self, time: float, true: Array) -> str:
-        """Look at the robot's true pose; return why the tour is over, or nothing."""
-        place = np.asarray(true[:2, 3])
-        if self.track:
-            self.driven += math.hypot(place[0] - self.track[-1][1], place[1] - self.track[-1][2])
-        self.time = time
-        self.track.append((time, float(place[0]), float(place[1])))
+        """Look at the robot's true pose at a time in seconds; return why the tour is over, or nothing.
+
+        As long as the robot has never said where it is, its true place counts.
+        """
+        place = np.array(true[:2, 3])
+        if self.place is not None:
+            self.driven += math.hypot(place[0] - self.place[0], place[1] - self.place[1])
+        self.place, self.time = place, time
         believed = place if self.believed is None else self.believed
-        target = self.targets[self.index]
-        if np.linalg.norm(believed - target) < BELIEVED and np.linalg.norm(place - target) < TRUE:
-            self.reached += 1
-            self.index += 1
+        if self.index < len(self.targets):
+            target = self.targets[self.index]
+            if np.hypot(*(believed - target)) < self.radius and np.hypot(*(place - target)) < TRUE:
+                self.index += 1
+        self.track.append((time, self.driven))
         self.ending = self._ending(time)
         return self.ending
 
     def _ending(self, time: float) -> str:
         if self.index == len(self.targets):
-            return "tour finished"
+            return FINISHED
         if self.errors and self.errors[-1] > LOST:
-            return "lost"
+            return LOST_WAY
         if time > self.limit:
-            return "time is up"
-        while self.track[-1][0] - self.track[0][0] > SLOW_TIME:
+            return TIME_UP
+        while self.track[0][0] < time - SLOW_TIME:
             self.track.popleft()
-        if time >= SLOW_TIME:
-            steps = np.diff(np.array(self.track)[:, 1:], axis=0)
-            if np.linalg.norm(steps, axis=1).sum() / SLOW_TIME < SLOW:
-                return "stuck"
+        began, driven = self.track[0]
+        if time - began > SLOW_TIME - 0.05 and (self.driven - driven) / SLOW_TIME < SLOW:
+            return STUCK
         return ""
 
     def summary(self) -> dict[str, Any]:
-        """Return targets, reached, the error's quantiles in metres, metres driven and mean speed."""
+        """Return targets, reached, the error's quantiles, metres driven, seconds and the ending, all as numbers."""
         errors = np.array(self.errors) if self.errors else np.zeros(1)
         return {
             "targets": len(self.targets),
-            "reached": self.reached,
-            "ending": self.ending or "stopped",
+            "reached": self.index,
             "localization_error_m": {
                 "median": float(np.median(errors)),
                 "p95": float(np.percentile(errors, 95)),
                 "max": float(errors.max()),
             },
             "driven_m": self.driven,
+            "time_s": self.time,
             "mean_speed": self.driven / self.time if self.time > 0 else 0.0,
+            "ending": {ending.replace(" ", "_"): int(ending == self.ending) for ending in ENDINGS},
         }

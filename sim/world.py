@@ -1,6 +1,6 @@
 """One session: a building, its furniture and people, and the robot in it.
 
-world = World("sim/buildings/default.yaml", "easy", "A", seed=1)
+world = World("default", "easy", "A", seed=1)
 frame = world.step(linear=0.5, angular=0.0)
 """
 
@@ -14,32 +14,38 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from graph.geometry import interpolate, planar, wrap, yaw
+from graph.geometry import planar, wrap, yaw
 from sim.building import Building, BuildingError
 from sim.building_file import load
-from sim.crowd import Crowd, spots
+from sim.clearance import clearance, length_of
+from sim.crowd import Crowd, spots, stature
 from sim.figure import figures, placed, radii, sitting
 from sim.furniture import SEAT_HEIGHT
-from sim.layout import draw
-from sim.lidar import NOTHING, PRESETS, Hits, Lidar, LidarSpec
+from sim.layout import RESOLUTION, Seat, draw
+from sim.lidar import NOTHING, PRESETS, Hits, Lidar, LidarSpec, People
 from sim.odometry import Odometer, OdometryNoise
-from sim.physics import SUBSTEP, Physics
+from sim.physics import GLIDE, SUBSTEP, Physics
 from sim.scenario import load_scenario
-from sim.solids import Body, Box, Truth, triangles_of
+from sim.solids import Body, Box, Prism, Truth, triangles_of
+from sim.sweep import along
 
 Array = npt.NDArray[np.float64]
 
 GROUND = 0.05  # metres: everything below is ground, as in the paper's simulator
 ENCOUNTER = 1.0  # seconds without touch after which a contact counts as a new one
-SLICES = 32  # parts of a rolling scan in which people stand still
+FLOOR = 100.0  # metres of floor around the building
+ROOM_CELL = 0.2  # metres, of the grid that tells who is in which room
 
 
 class Frame(NamedTuple):
-    """One scan and all truth about it. Points in the lidar's frame at the beginning of the scan."""
+    """One scan and all truth about it, ring by ring.
+
+    Points in the lidar's frame; those of a rolling scan in its frame at their own moment.
+    """
 
     points: npt.NDArray[np.float32]  # (n, 3) metres
     ring: npt.NDArray[np.uint8]
-    time_offset: npt.NDArray[np.float32] | None  # seconds after the beginning; None: all at once
+    time_offset: npt.NDArray[np.float32] | None  # seconds, negative: before the end of the sweep; None: all at once
     truth: npt.NDArray[np.uint8]
     moving: npt.NDArray[np.bool_]
     instance: npt.NDArray[np.int32]
@@ -55,81 +61,117 @@ class State(NamedTuple):
     people: Array  # (p, 3): x, y, heading; walkers, then sitters
     people_moving: npt.NDArray[np.bool_]
     people_instance: npt.NDArray[np.int32]
-    contacts: npt.NDArray[np.int32]  # instances that the robot touches
+    contacts: npt.NDArray[np.int32]  # instances that the robot touched during the step
 
 
 class World:
-    """A session, fixed to the bit by building, scenario, tour and seed. Raises BuildingError for bad input, by name."""
+    """A session, fixed to the bit by building, scenario, tour and seed. Raises BuildingError for bad input, by name.
+
+    Instances are the indices of `bodies` (0 is the floor), then the walkers, then the sitters.
+    """
 
     def __init__(
         self,
-        building: Path | str,
+        building: Path | str | Building,
         scenario: Path | str,
         tour: str,
         seed: int,
         *,
         lidar: str | LidarSpec = "paper",
         rolling: bool | None = None,
+        dropout: float | None = None,
         odometry: OdometryNoise | None = None,
     ) -> None:
-        self.building: Building = load(building)
+        self.building: Building = building if isinstance(building, Building) else load(building)
         self.scenario = load_scenario(scenario)
         if isinstance(lidar, str):
             if lidar not in PRESETS:
                 raise BuildingError(f"there is no lidar {lidar!r}; there are {', '.join(PRESETS)}")
             lidar = PRESETS[lidar]
-        self.spec = lidar if rolling is None else msgspec.structs.replace(lidar, rolling=rolling)
+        changes = {"rolling": rolling, "dropout": dropout}
+        self.spec = msgspec.structs.replace(lidar, **{name: v for name, v in changes.items() if v is not None})
         self.start = self.building.start_pose(tour)
         self.targets = np.array(self.building.tours[tour].targets, np.float64).reshape(-1, 2)
         self.layout = draw(self.building, self.scenario, tour, seed)
+        self.length = length_of(self.layout.way)  # metres, through all targets
         self.bodies = [self._floor(), *self.layout.bodies]
         triangles, owner = triangles_of(self.bodies)
         self.lidar = Lidar(self.spec, triangles, owner)
         self.physics = Physics(self.layout.bodies, self.start)
         self.noise = np.random.default_rng([seed, 3])
         self.odometer = Odometer(self.start, odometry or OdometryNoise(), np.random.default_rng([seed, 4]))
+        shadows = [_shadow(seat) for seat in self.layout.seats]
+        self.free = clearance(self.layout.bodies + shadows, self.building.bounds(), RESOLUTION)
+        self._rooms()
         self._people(np.random.default_rng([seed, 2]))
         self.truth = np.array([body.truth for body in self.bodies] + self.person_truth, np.uint8)
         self.time = 0.0
         self.touched: dict[int, float] = {}  # instance: when it was last touched
         self.collisions = {"people": 0, "things": 0}
-        self.before = self.motion = self.physics.motion()
+        self.motion = self.physics.motion()
         self.odometer.advance(self.motion, 0.0, 1.0)
-        self.bodies_before = self.capsules = self._capsules()
+        self.capsules = self._capsules()
+        self.bodies_before = self.capsules
+        self.trail = [self.motion.world_from_base] * 2  # evenly over the last advance
+        self.elapsed = 0.0  # seconds of the last advance
         self.touching = np.zeros(0, np.int32)
 
     def _floor(self) -> Body:
         x0, y0, x1, y1 = self.building.bounds()
-        slab = Box((x0 + x1) / 2, (y0 + y1) / 2, -0.05, x1 - x0 + 2.0, y1 - y0 + 2.0, 0.1)
+        slab = Box((x0 + x1) / 2, (y0 + y1) / 2, -0.05, x1 - x0 + 2 * FLOOR, y1 - y0 + 2 * FLOOR, 0.1)
         return Body("floor", Truth.GROUND, (slab,))
 
+    def _rooms(self) -> None:
+        """Rasterize which room every place is in; -1: none."""
+        x0, y0, x1, y1 = self.building.bounds()
+        x, y = np.meshgrid(np.arange(x0, x1, ROOM_CELL), np.arange(y0, y1, ROOM_CELL))
+        self.room = np.full(x.shape, -1, np.int16)
+        cells = np.stack([x.ravel(), y.ravel()], 1) + ROOM_CELL / 2
+        for index, room in reversed(list(enumerate(self.building.rooms))):
+            self.room[room.contains(cells).reshape(x.shape)] = index
+
+    def rooms_of(self, places: Array) -> npt.NDArray[np.int16]:
+        """Return the index of the room that each place (n, 2) is in, or -1."""
+        x0, y0, _, _ = self.building.bounds()
+        cells = ((places - (x0, y0)) / ROOM_CELL).astype(np.int64)
+        rows, columns = self.room.shape
+        return self.room[np.clip(cells[:, 1], 0, rows - 1), np.clip(cells[:, 0], 0, columns - 1)]
+
     def _people(self, rng: np.random.Generator) -> None:
-        """Draw walkers by density, and sitters on the seats that are taken."""
-        area = self.building.populated_area()
-        wanderers, followers = (round(density * area) for density in (self.scenario.wanderers, self.scenario.followers))
-        rooms = [np.array(room.polygon) for room in self.building.rooms if room.populated]
-        boxes = [np.array([*room.min(0), *room.max(0)]) for room in rooms]
-        places = spots(self.layout.free, boxes, wanderers + followers, np.array(self.start[:2]), rng)
-        self.wanted_people = wanderers + followers
-        following = np.arange(len(places)) >= len(places) - min(followers, len(places))
-        self.crowd = Crowd(places, following, self.scenario.attentive, rng)
-        seats = np.array(self.layout.seats, np.float64).reshape(-1, 3)
-        heights = np.clip(rng.normal(1.71, 0.09, len(seats)), 1.50, 1.95)
-        builds = np.clip(rng.normal(1.0, 0.08, len(seats)), 0.85, 1.25)
-        figure = sitting() * heights[:, None, None, None]
-        sitters = placed(figure, *seats.T) if len(seats) else np.zeros((0, *sitting().shape))
-        self.radii = np.concatenate([radii(self.crowd.height, self.crowd.build), radii(heights, builds)])
-        if len(seats):
-            lift = SEAT_HEIGHT + 0.02 - (sitters[:, 0, :, 2].min(1) - self.radii[len(self.crowd.height) :, 0])
-            sitters[..., 2] += np.minimum(lift, 0.05)[:, None, None]
-        self.sitters, self.seats = sitters, seats
-        self.person_truth = [int(Truth.MOVING_PERSON)] * len(places) + [int(Truth.STILL_PERSON)] * len(seats)
+        """Draw walkers by density, room by room, and sitters on the seats that are taken."""
+        rooms = [room for room in self.building.rooms if room.populated]
+        areas = np.array([room.area(self.building.wall) for room in rooms])
+        total = float(areas.sum())
+        wanted = [round(density * total) for density in (self.scenario.wanderers, self.scenario.followers)]
+        keep = np.array([[*self.start[:2], 1.5]])
+        places, following = [np.zeros((0, 2))], [np.zeros(0, np.bool_)]
+        for follows, count in zip((False, True), wanted, strict=True):
+            for room, share in zip(rooms, _apportion(count, areas), strict=True):
+                ring = np.array(room.polygon)
+                found = spots(self.free, np.array([*ring.min(0), *ring.max(0)]), int(share), keep, rng)
+                keep = np.concatenate([keep, np.column_stack([found, np.full(len(found), 0.7)])])
+                places.append(found)
+                following.append(np.full(len(found), follows))
+        self.wanted_people = sum(wanted)
+        self.crowd = Crowd(np.concatenate(places), np.concatenate(following), self.scenario.attentive, rng)
+        self.seats = np.array(self.layout.seats, np.float64).reshape(-1, 3)
+        heights, builds = stature(len(self.seats), rng)
+        sitters = placed(sitting() * heights[:, None, None, None], self.seats[:, 0], self.seats[:, 1], self.seats[:, 2])
+        breadth = radii(heights, builds)
+        lift = SEAT_HEIGHT + 0.02 - (sitters[:, 0, :, 2].min(1) - breadth[:, 0])
+        lift = np.clip(lift, 0.0, 0.05)  # feet rather leave the floor than hips enter the seat
+        sitters[..., 2] += lift[:, None, None]
+        self.sitters = sitters
+        self.radii = np.concatenate([radii(self.crowd.height, self.crowd.build), breadth])
+        self.person_truth = [int(Truth.MOVING_PERSON)] * len(self.crowd.position)
+        self.person_truth += [int(Truth.STILL_PERSON)] * len(self.seats)
 
     def _capsules(self) -> Array:
-        """Return the capsules (p, 16, 2, 3) of all people as they stand now."""
+        """Return the capsules (p, 16, 2, 3) of all people as they are now."""
         crowd = self.crowd
         walkers = figures(crowd.phase(), crowd.stride_share(), crowd.height)
-        return np.concatenate([placed(walkers, *crowd.position.T, crowd.facing), self.sitters])
+        walkers = placed(walkers, crowd.position[:, 0], crowd.position[:, 1], crowd.facing)
+        return np.concatenate([walkers, self.sitters])
 
     def step(self, linear: float, angular: float, seconds: float = 0.1) -> Frame:
         """Drive for a while, then scan. linear: m/s, angular: rad/s."""
@@ -138,21 +180,32 @@ class World:
 
     def advance(self, linear: float, angular: float, seconds: float = 0.1) -> None:
         """Let people walk and the robot drive for a while."""
-        self.before, self.bodies_before = self.motion, self.capsules
-        base = self.motion.world_from_base
-        self.crowd.advance(seconds, self.layout.free, (float(base[0, 3]), float(base[1, 3]), yaw(base)))
+        before = self.motion
+        base = before.world_from_base
+        robot = float(base[0, 3]), float(base[1, 3]), yaw(base)
+        here = int(self.rooms_of(np.array([robot[:2]]))[0])
+        with_robot = (self.rooms_of(self.crowd.position) == here) & (here >= 0)
+        self.bodies_before = self.capsules
+        self.crowd.advance(seconds, self.free, robot, with_robot)
         self.capsules = self._capsules()
-        self.physics.place_people(self.capsules, self.radii, (float(base[0, 3]), float(base[1, 3])))
         self.physics.drive(linear, angular)
+        self.trail = [base]
         touched: set[int] = set()
-        for _ in range(round(seconds / SUBSTEP)):
-            self.physics.step()
-            still, people = self.physics.contacts()
-            touched |= {1 + body for body in still} | {len(self.bodies) + person for person in people}
+        rounds = max(1, round(seconds / SUBSTEP / GLIDE))
+        for glide in range(1, rounds + 1):
+            share = glide / rounds
+            self.physics.place_people(self.bodies_before * (1.0 - share) + self.capsules * share, self.radii)
+            for _ in range(GLIDE):
+                self.physics.step()
+                still, people = self.physics.contacts()
+                touched |= {1 + body for body in still} | {len(self.bodies) + person for person in people}
+            if self.spec.rolling:
+                self.trail.append(self.physics.motion().world_from_base)
         self.time += seconds
+        self.elapsed = seconds
         self._count(touched)
         self.motion = self.physics.motion()
-        turned = float(wrap(yaw(self.motion.world_from_base) - yaw(self.before.world_from_base)))
+        turned = float(wrap(yaw(self.motion.world_from_base) - yaw(base)))
         self.odometer.advance(self.motion, turned, seconds)
 
     def _count(self, touched: set[int]) -> None:
@@ -167,55 +220,56 @@ class World:
         """Return the sensor's place on the robot (4, 4)."""
         return planar(0.0, 0.0, 0.0, self.spec.height)
 
+    def sensor(self) -> tuple[Array, Array]:
+        """Return world_from_lidar (4, 4), or (columns, 4, 4), and each column's share of the last step."""
+        mount = self.base_from_lidar()
+        if not self.spec.rolling or self.elapsed == 0.0:
+            return self.motion.world_from_base @ mount, np.ones(self.spec.columns)
+        share = 1.0 - (1.0 - self.lidar.share) * min(1.0, 1.0 / self.spec.rate / self.elapsed)
+        return along(np.array(self.trail), share) @ mount, share
+
     def scan(self) -> Frame:
         """Scan from where the robot is; a rolling scan began one period ago and ends now."""
-        spec = self.spec
-        mount = self.base_from_lidar()
-        first = len(self.bodies)
-        offsets = None
-        if spec.rolling:
-            share = np.arange(spec.columns) / spec.columns
-            poses = np.array(
-                [interpolate(self.before.world_from_base, self.motion.world_from_base, float(s)) @ mount for s in share]
-            )
-            bounds = np.linspace(0, spec.columns, SLICES + 1).astype(int)
-            slices = list(zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True))
-            middles = [(begin + end) / 2 / spec.columns for begin, end in slices]
-            people = [self.bodies_before * (1 - s) + self.capsules * s for s in middles]
-            hits = self.lidar.sweep(poses, slices, people, self.radii, first)
-            offsets = (share[self.lidar.column] / spec.rate).astype(np.float32)
-            places = poses[self.lidar.column]
-            heights = np.einsum("ni,ni->n", places[:, 2, :3], self.lidar.directions) * hits.distance + places[:, 2, 3]
+        pose, share = self.sensor()
+        hits = self.lidar.shoot(pose, share, self.people())
+        if pose.ndim == 3:
+            pose = pose[self.lidar.column]
+            heights = np.einsum("ni,ni->n", pose[:, 2, :3], self.lidar.directions) * hits.distance + pose[:, 2, 3]
         else:
-            pose = self.motion.world_from_base @ mount
-            hits = self.lidar.shoot(pose, self.capsules, self.radii, first)
             heights = (self.lidar.directions @ pose[2, :3]) * hits.distance + pose[2, 3]
-        return self._frame(hits, heights, offsets)
+        return self._frame(hits, heights)
 
-    def _frame(self, hits: Hits, heights: Array, offsets: npt.NDArray[np.float32] | None) -> Frame:
+    def people(self) -> People:
+        """Return everybody's capsules before and after the last step."""
+        return People(self.bodies_before, self.capsules, self.radii, len(self.bodies))
+
+    def _frame(self, hits: Hits, heights: Array) -> Frame:
         """Add noise, drop what the sensor does not see, and label what is left."""
         spec = self.spec
-        measured = hits.distance + (spec.noise * self.noise.standard_normal(len(hits.distance), np.float32))
+        measured = hits.distance + np.float32(spec.noise) * self.noise.standard_normal(len(hits.distance), np.float32)
         if spec.step > 0:
-            measured = np.round(measured / spec.step) * spec.step
+            measured = np.round(measured / np.float32(spec.step)) * np.float32(spec.step)
         keep = (hits.body != NOTHING) & (measured >= spec.nearest) & (measured <= spec.farthest)
         if spec.dropout > 0:
             grazing = np.clip(1.0 - hits.cosine / 0.26, 0.0, 1.0)  # beyond 75 degrees of incidence
             far = np.clip(hits.distance / spec.farthest - 0.5, 0.0, 0.5) * 2.0
             keep &= self.noise.random(len(keep), np.float32) >= spec.dropout * np.maximum(grazing, far)
-        body = hits.body[keep]
+        kept = np.flatnonzero(keep)
+        body = hits.body[kept]
         truth = self.truth[body]
-        truth[heights[keep] < GROUND] = Truth.GROUND
-        moves = np.concatenate(
-            [np.zeros(len(self.bodies), np.bool_), self.crowd.moving(), np.zeros(len(self.seats), np.bool_)]
-        )
+        truth[heights[kept] < GROUND] = Truth.GROUND
+        moves = np.zeros(len(self.truth), np.bool_)
+        moves[len(self.bodies) : len(self.bodies) + len(self.crowd.position)] = self.crowd.moving()
+        offset = None
+        if spec.rolling:
+            offset = ((self.lidar.share[self.lidar.column[kept]] - 1.0) / spec.rate).astype(np.float32)
         return Frame(
-            points=(self.lidar.directions[keep] * measured[keep, None]).astype(np.float32),
-            ring=self.lidar.ring[keep],
-            time_offset=None if offsets is None else offsets[keep],
+            points=(self.lidar.directions[kept] * measured[kept, None]).astype(np.float32),
+            ring=self.lidar.ring[kept],
+            time_offset=offset,
             truth=truth,
             moving=moves[body],
-            instance=body.astype(np.int32),
+            instance=body,
         )
 
     def state(self) -> State:
@@ -234,3 +288,19 @@ class World:
             (len(self.bodies) + np.arange(len(people))).astype(np.int32),
             self.touching,
         )
+
+
+def _shadow(seat: Seat) -> Body:
+    """Return the floor that a sitter takes, trunk and legs, for others to walk around."""
+    ahead = Prism(seat.x + 0.35 * math.cos(seat.yaw), seat.y + 0.35 * math.sin(seat.yaw), 0.3, 0.16, 0.6, 8)
+    return Body("sitter", Truth.STILL_PERSON, (Prism(seat.x, seat.y, 0.6, 0.2, 1.2, 8), ahead))
+
+
+def _apportion(count: int, areas: Array) -> npt.NDArray[np.int64]:
+    """Divide a count in proportion to areas, so that the parts sum to it (largest remainders)."""
+    exact = count * areas / max(float(areas.sum()), 1e-9)
+    parts = np.floor(exact).astype(np.int64)
+    rest = count - int(parts.sum())
+    if len(areas):
+        parts[np.argsort(-(exact - parts), kind="stable")[:rest]] += 1
+    return parts
