@@ -17,6 +17,7 @@ from rich.progress import Progress
 
 REFRESH = 0.25  # seconds on a terminal
 QUIET_REFRESH = 10.0  # seconds where output goes to a file
+COMPILING = 3.0  # seconds without any progress after which the line says why
 WINDOW = 200  # calls over which the shown latency is taken
 
 
@@ -65,6 +66,8 @@ class StatusLine:
             return self.phase
         wall = max(time.monotonic() - self.began, 1e-9)
         stamp = max(self.stamps.values(), default=0) / 1e9
+        if stamp == 0 and wall > COMPILING:
+            return f"{wall:5.0f} s in the first calls: numba compiles, once on a machine"
         parts = [f"{stamp:7.1f} s  {stamp / wall:4.1f} x real time"]
         for name in self.names:
             if recent := self.recent[name]:

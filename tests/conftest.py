@@ -19,7 +19,9 @@ operators:
   counter: {run: tests.sample_operators:Counter, inputs: {tick: timer/10hz}, config: {last: 30}}
   relay: {run: tests.sample_operators:Relay, inputs: {count: counter/count}, config: {offset: 1}}
   adder: {run: tests.sample_operators:Adder, inputs: {left: {from: relay/count, delay: 30ms}, right: counter/count}}
-  feedback: {run: tests.sample_operators:Feedback, inputs: {back: {from: feedback/count, delay: 50ms}, tick: timer/20hz}}
+  feedback:
+    run: tests.sample_operators:Feedback
+    inputs: {back: {from: feedback/count, delay: 50ms}, tick: timer/20hz}
   maker: {run: tests.sample_operators:BlobMaker, inputs: {tick: timer/5hz}, config: {size: 3000}}
   blobs: {run: tests.sample_operators:BlobRelay, inputs: {blob: maker/blob}}
   screen: {run: tests.sample_operators:Screen, inputs: {count: relay/count}}
