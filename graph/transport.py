@@ -28,6 +28,7 @@ class Sample(NamedTuple):
     payload: bytes
     envelope: tuple[int, int, int]  # incarnation, sequence, stamp; zeros where there is none
     alive: bool = True
+    mark: bytes = b""  # the mark that travels with the last messages of a call
 
 
 def free_port(host: str = "127.0.0.1") -> int:
@@ -79,20 +80,28 @@ class Wire:
         """Close the session; without it Zenoh's threads keep the process alive."""
         self.session.close()  # type: ignore[no-untyped-call]
 
-    def _receive(self, sample: zenoh.Sample) -> None:
-        attachment = sample.attachment
-        envelope = _ENVELOPE.unpack(attachment.to_bytes()) if attachment is not None else (0, 0, 0)
-        key = str(sample.key_expr)[len(self.prefix) + 1 :]
-        self.inbox.put(Sample(key, sample.payload.to_bytes(), envelope, sample.kind == zenoh.SampleKind.PUT))
+    def _receiver(self, key: str) -> zenoh.handlers.Callback[zenoh.Sample]:
+        """Return a handler; it runs in a thread of Zenoh, so it does little. A key without wildcards is known ahead."""
+        known = None if "*" in key else key
+        skip, put = len(self.prefix) + 1, self.inbox.put
+
+        def receive(sample: zenoh.Sample) -> None:
+            envelope, mark = (0, 0, 0), b""
+            if (attachment := sample.attachment) is not None:
+                raw = attachment.to_bytes()
+                envelope, mark = _ENVELOPE.unpack_from(raw), raw[_ENVELOPE.size :]
+            name = known or str(sample.key_expr)[skip:]
+            put(Sample(name, sample.payload.to_bytes(), envelope, sample.kind == zenoh.SampleKind.PUT, mark))
+
+        return zenoh.handlers.Callback(receive, indirect=False)
 
     def subscribe(self, key: str) -> None:
         """Let everything put under a key (wildcards allowed) come into the inbox."""
-        self.session.declare_subscriber(f"{self.prefix}/{key}", zenoh.handlers.Callback(self._receive, indirect=False))
+        self.session.declare_subscriber(f"{self.prefix}/{key}", self._receiver(key))
 
     def watch(self, key: str) -> None:
         """Let liveliness tokens, present and future, come into the inbox."""
-        handler = zenoh.handlers.Callback(self._receive, indirect=False)
-        self.session.liveliness().declare_subscriber(f"{self.prefix}/{key}", handler, history=True)
+        self.session.liveliness().declare_subscriber(f"{self.prefix}/{key}", self._receiver(key), history=True)
 
     def declare_ready(self, name: str) -> None:
         """Raise the liveliness token that the readiness barrier waits for."""
@@ -107,11 +116,11 @@ class Wire:
             express=True,
         )
 
-    def put(self, key: str, payload: bytes, envelope: tuple[int, int, int] | None = None) -> None:
+    def put(self, key: str, payload: bytes, envelope: tuple[int, int, int] | None = None, mark: bytes = b"") -> None:
         """Put bytes; blocks while the way is full."""
         if key not in self.publishers:
             self.announce(key)
-        attachment = None if envelope is None else _ENVELOPE.pack(*envelope)
+        attachment = None if envelope is None else _ENVELOPE.pack(*envelope) + mark
         self.publishers[key].put(payload, attachment=attachment)
 
     def tell(self, key: str, record: msgspec.Struct) -> None:

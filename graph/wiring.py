@@ -43,6 +43,7 @@ class NodeSpec(msgspec.Struct, frozen=True):
     duration: int | None
     end: str | None
     ahead: int
+    heard: tuple[str, ...] = ()  # output ports that reach everyone who waits for this operator's marks
 
     @property
     def producers(self) -> tuple[str, ...]:
@@ -67,12 +68,15 @@ def wire(graph: Graph) -> list[NodeSpec]:
         record = {
             port: entry.record if isinstance(entry.record, str) else entry.record.get(port, "full") for port in outputs
         }
-        consumers = tuple(
-            other
+        wanted = {
+            other: {edge.port for edge in wanting.inputs.values() if edge.operator == name}
             for other, wanting in graph.operators.items()
-            if kind_of(classes[other]) != "sink" and any(edge.operator == name for edge in wanting.inputs.values())
-        )
+            if kind_of(classes[other]) != "sink"
+        }
+        consumers = tuple(other for other, mine in wanted.items() if mine)
         clock = graph.clock
+        waiting = [mine for other, mine in wanted.items() if mine or (clock.end == name and other != name)]
+        heard = tuple(port for port in outputs if all(port in mine for mine in waiting))
         specs.append(
             NodeSpec(
                 name=name,
@@ -85,6 +89,7 @@ def wire(graph: Graph) -> list[NodeSpec]:
                 outputs=outputs,
                 record=record,
                 consumers=consumers,
+                heard=heard,
                 threads=entry.threads,
                 restart=entry.restart,
                 mode=clock.mode,

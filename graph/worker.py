@@ -147,6 +147,8 @@ class Worker:
             schedule = self.lockstep or self.realtime
             assert schedule is not None
             schedule.deliver(rest, incarnation, sequence, stamp, sample.payload)
+            if sample.mark and self.lockstep is not None:
+                self.lockstep.mark(rest.partition("/")[0], msgspec.msgpack.decode(sample.mark, type=Mark))
         elif kind == "mark" and self.lockstep is not None:
             self.lockstep.mark(rest, msgspec.msgpack.decode(sample.payload, type=Mark))
         elif kind == "flow" and self.lockstep is not None:
@@ -180,17 +182,29 @@ class Worker:
     # what goes out
 
     def emit(self, emission: Emission) -> None:
-        """Put a message on the wire, and remember it for the shard."""
-        envelope = (self.boot.incarnation, emission.sequence, emission.stamp)
-        self.wire.put(f"data/{self.spec.name}/{emission.port}", emission.payload, envelope)
+        """Put a message on the wire, and remember it for the shard.
+
+        In lockstep nobody may handle it before this call's mark has come, so it waits for that and they travel as one.
+        """
+        if self.lockstep is None:
+            self._put(emission)
         self.emissions.append(emission)
 
+    def _put(self, emission: Emission, mark: bytes = b"") -> None:
+        envelope = (self.boot.incarnation, emission.sequence, emission.stamp)
+        self.wire.put(f"data/{self.spec.name}/{emission.port}", emission.payload, envelope, mark)
+
     def promise(self) -> None:
-        """Tell the neighbours how far this operator is, if that has changed."""
+        """Put what the call emitted, and tell the neighbours how far this operator is, if that has changed."""
         assert self.lockstep is not None
-        if (mark := self.lockstep.news(tuple(self.node.counts.values()))) is None:
+        mark = self.lockstep.news(tuple(self.node.counts.values()))
+        told = b"" if mark is None else msgspec.msgpack.encode(mark)
+        for emission in self.emissions:
+            self._put(emission, told)
+        if mark is None:
             return
-        self.wire.tell(f"mark/{self.spec.name}", mark)
+        if not any(emission.port in self.spec.heard for emission in self.emissions):
+            self.wire.put(f"mark/{self.spec.name}", told)
         if mark.watermark >= self.flowed + self.spec.ahead // FLOW_PARTS:
             self.flowed = mark.watermark
             self.wire.put(f"flow/{self.spec.name}", b"", (0, 0, mark.watermark))
