@@ -180,7 +180,7 @@ class _Aggregate(torch.autograd.Function):
     def forward(ctx: Any, features: torch.Tensor, matrix: Matrix) -> torch.Tensor:
         ctx.matrix = matrix
         links = matrix.arrays
-        out = torch.empty((matrix.points, matrix.kernel_points, features.shape[1]))
+        out = features.new_empty((matrix.points, matrix.kernel_points, features.shape[1]))
         parts = (links.starts, links.columns, links.places, links.weights)
         split(gather, matrix.points, *parts, features.detach().contiguous().numpy(), out.numpy())
         return out
@@ -189,7 +189,7 @@ class _Aggregate(torch.autograd.Function):
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, None]:
         matrix, gradient = ctx.matrix, gradients[0]
         links = matrix.arrays
-        out = torch.zeros((matrix.sources, gradient.shape[2]))
+        out = gradient.new_zeros((matrix.sources, gradient.shape[2]))
         parts = (links.starts, links.columns, links.places, links.weights)
         split(scatter, gradient.shape[2], *parts, gradient.contiguous().numpy(), out.numpy())
         return out, None
@@ -199,7 +199,7 @@ class _Largest(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: torch.Tensor, matrix: Matrix) -> torch.Tensor:
         links = matrix.arrays
-        out = torch.empty((matrix.points, features.shape[1]))
+        out = features.new_empty((matrix.points, features.shape[1]))
         ctx.winners, ctx.sources = np.empty(tuple(out.shape), np.int32), matrix.sources
         parts = (links.neighbour_starts, links.neighbours, features.detach().contiguous().numpy())
         split(gather_largest, matrix.points, *parts, out.numpy(), ctx.winners)
@@ -208,7 +208,7 @@ class _Largest(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, None]:
         gradient = gradients[0].contiguous()
-        out = torch.zeros((ctx.sources, gradient.shape[1]))
+        out = gradient.new_zeros((ctx.sources, gradient.shape[1]))
         split(scatter_largest, gradient.shape[1], ctx.winners, gradient.numpy(), out.numpy())
         return out, None
 

@@ -32,7 +32,7 @@ class Classified(NamedTuple):
 
     points: Floats  # (m, 3) barycentres, metres, lidar's frame
     scores: Floats  # (m, 4) probability of labels 1 to 4
-    source: Ints  # (m,) point of the frame nearest to each barycentre
+    source: Ints  # (m,) of each voxel the point nearest to its barycentre
     table: Floats  # (t, 4) scores, of which each point of the frame has one row:
     rows: Ints  # (n,) or -1 for points that no network was asked about
 

@@ -13,7 +13,6 @@ from operators.kpconv.pyramid import Geometry, Pyramid
 from operators.kpconv.settings import CLASSES
 
 SLOPE = 0.1  # of the leaky rectifiers
-MOMENTUM = 0.02  # of the batch norms' running statistics
 
 
 class Batch(NamedTuple):
@@ -55,7 +54,7 @@ class Unary(nn.Module):
     def __init__(self, inputs: int, outputs: int, *, rectified: bool = True) -> None:
         super().__init__()
         self.linear = nn.Linear(inputs, outputs, bias=False)
-        self.norm = nn.BatchNorm1d(outputs, momentum=MOMENTUM)
+        self.norm = nn.BatchNorm1d(outputs)
         self.rectified = rectified
 
     def forward(self, features: Tensor) -> Tensor:
@@ -70,7 +69,7 @@ class Simple(nn.Module):
     def __init__(self, inputs: int, outputs: int, kernel_points: int) -> None:
         super().__init__()
         self.convolution = KPConv(inputs, outputs, kernel_points)
-        self.norm = nn.BatchNorm1d(outputs, momentum=MOMENTUM)
+        self.norm = nn.BatchNorm1d(outputs)
 
     def forward(self, features: Tensor, matrix: Matrix, *, plain: bool = False) -> Tensor:
         """Map (m, inputs) to (q, outputs)."""
@@ -133,7 +132,7 @@ class KPFCNN(nn.Module):
             features = block(features, batch.convolutions[level + 1], plain=plain)
             skips.append(features)
         for level, decoder in zip(reversed(range(len(self.decoders))), self.decoders, strict=True):
-            features = decoder(torch.cat([features[batch.parents[level].long()], skips[level]], 1))
+            features = decoder(torch.cat([features.index_select(0, batch.parents[level]), skips[level]], 1))
         return self.last(nn.functional.leaky_relu(self.hidden(features), SLOPE))
 
 

@@ -8,6 +8,7 @@ from typing import Literal
 import msgspec
 
 WARM_UP = 20  # steps of rising rate; they do not depend on the number of steps, so that they can be timed to choose it
+STATISTICS = 0.02  # momentum of the batch norms' running statistics
 EPOCH = 500  # steps; the authors' rate falls by 0.1^(1 / 150) an epoch
 
 
@@ -34,3 +35,7 @@ class Plan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             return self.rate * 0.1 ** (step / EPOCH / 150.0)
         share = (step - WARM_UP) / max(1, self.steps - WARM_UP)
         return 0.5 * self.rate * (1.0 + math.cos(math.pi * min(share, 1.0)))
+
+    def statistics_at(self, step: int) -> float:
+        """Return the batch norms' momentum: at first larger, so that statistics forget the untrained network."""
+        return max(STATISTICS, 4.0 / (step + 4.0))

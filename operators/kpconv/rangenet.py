@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from operators.kpconv.frames import Frames
 from operators.kpconv.grid import Floats
-from operators.kpconv.network import MOMENTUM, SLOPE
+from operators.kpconv.network import SLOPE
 from operators.kpconv.projection import CHANNELS, project
 from operators.kpconv.settings import CLASSES, Settings
 from operators.kpconv.spheres import IGNORED, NOISE, STRETCH
@@ -27,7 +27,7 @@ class Convolution(nn.Module):
     def __init__(self, inputs: int, outputs: int, stride: tuple[int, int] = (1, 1)) -> None:
         super().__init__()
         self.convolution = nn.Conv2d(inputs, outputs, 3, stride, bias=False)
-        self.norm = nn.BatchNorm2d(outputs, momentum=MOMENTUM)
+        self.norm = nn.BatchNorm2d(outputs)
 
     def forward(self, image: Tensor) -> Tensor:
         """Map (b, inputs, rows, columns) to (b, outputs, rows / stride, columns / stride)."""

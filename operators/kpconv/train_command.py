@@ -134,7 +134,10 @@ def run(args: argparse.Namespace) -> int:
     group = group_of(device)
     torch.set_num_threads(max(1, args.threads // group.size))
     quiet = group.rank > 0 or args.json
-    budget = nanoseconds(args.budget) / 1e9 if args.budget else None
+    try:
+        budget = nanoseconds(args.budget) / 1e9 if args.budget else None
+    except ValueError as error:
+        raise UserError(f"--budget: {error}") from error
     plan = Plan(
         steps=10**9 if budget is not None else (args.steps or 3000),
         **{name: getattr(args, name) for name in ("batch", "seed", "check", "patience", "rate", "momentum", "decay")},

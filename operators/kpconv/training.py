@@ -92,7 +92,6 @@ class Trainer:
         self.device, self.group = torch.device(device), group or Group()
         self.state = Checkpoint(settings, plan, 0, [])
         torch.manual_seed(plan.seed)
-        torch.use_deterministic_algorithms(self.device.type == "cpu")
         self.network = self.recipe.network().to(self.device)
         self.model: nn.Module = self.network
         if self.group.size > 1:
@@ -128,6 +127,9 @@ class Trainer:
         self.model.train()
         for options in self.optimizer.param_groups:
             options["lr"] = self.plan.rate_at(self.state.step)
+        for module in self.network.modules():
+            if isinstance(module, (nn.BatchNorm1d, nn.BatchNorm2d)):
+                module.momentum = self.plan.statistics_at(self.state.step)
         self.optimizer.zero_grad()
         logits = self.model(inputs)
         loss = nn.functional.cross_entropy(logits, targets, ignore_index=IGNORED)
