@@ -211,7 +211,7 @@ class Dashboard(Sink):
         address: str = ""  # of a running viewer: rerun+http://127.0.0.1:9876/proxy
         web: bool = False  # serve a web page on this machine and print its address
         save: Path | None = None  # an .rrd file; without `web` or `address` instead of a viewer
-        frames: float = 10.0  # point clouds a second of the wall clock, at most, of each port
+        frames: float = 5.0  # point clouds a second of the wall clock, at most, of each port
 
     config: Config
 
