@@ -23,7 +23,9 @@ def wall_bodies(building: Building) -> list[Body]:
     things: dict[str, list[Box]] = {}
     for index, block in enumerate(building.blocks):
         low, high = np.array(block.low), np.array(block.high)
-        box = Box(*((low + high) / 2).tolist(), *(high - low).tolist(), math.radians(block.heading))
+        x, y, z = ((low + high) / 2).tolist()
+        dx, dy, dz = (high - low).tolist()
+        box = Box(x, y, z, dx, dy, dz, math.radians(block.heading))
         things.setdefault(block.part_of or f"block {index}", []).append(box)
     return bodies + [Body(name, Truth.WALL, tuple(parts)) for name, parts in things.items()]
 
@@ -79,13 +81,14 @@ def _wall(building: Building, index: int, segment: Segment) -> Body:
         return Box(float(x), float(y), (low + height) / 2, last - first, thickness, height - low, turn)
 
     parts: list[Box] = []
-    reached = -thickness / 2  # walls reach half a thickness beyond their ends, which closes the corners
+    beyond = thickness / 2 - 0.002  # metres past the ends, which closes corners; short of the other wall's face, so
+    reached = -beyond  # that every point of a face belongs to one wall
     for first, last, lintel in openings(building, segment):
         if first > reached:
             parts.append(piece(reached, first, 0.0))
         if lintel < height:
             parts.append(piece(first, last, lintel))
         reached = max(reached, last)
-    if length + thickness / 2 > reached:
-        parts.append(piece(reached, length + thickness / 2, 0.0))
+    if length + beyond > reached:
+        parts.append(piece(reached, length + beyond, 0.0))
     return Body(f"wall {index}", Truth.WALL, tuple(parts))

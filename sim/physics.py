@@ -25,7 +25,8 @@ ACCELERATION, TURN_ACCELERATION = 1.0, 2.5  # m/s^2, rad/s^2
 MAST = 0.06, 0.68  # metres: width and top of the column that carries the lidar
 PERSON_REACH = 1.6  # metres from the robot within which people have bodies
 GLIDE = 6  # substeps between two placements of walking people
-BATCH = 16384  # rays that PyBullet takes at once
+STILL_GROUP = 2  # Bullet's collision group of what has no mass
+BATCH = 8192  # rays at once; PyBullet silently drops those beyond 16383
 
 
 class Motion(NamedTuple):
@@ -189,17 +190,26 @@ class Physics:
         self.people[person] = made
         self.owner |= dict.fromkeys(made, person)
 
-    def rays(self, origins: Array, ends: Array) -> tuple[Array, npt.NDArray[np.int64]]:
-        """Cast rays (n, 3) to (n, 3), in metres, by PyBullet's rayTestBatch in one thread.
+    def rays(self, origins: Array, ends: Array) -> tuple[Array, npt.NDArray[np.int32]]:
+        """Cast rays (n, 3) to (n, 3), in metres, by PyBullet's rayTestBatch in one thread; they pass through the robot.
 
-        Returns the share of the way at which each hits (1: nothing) and PyBullet's number of the body (-1: nothing).
+        Returns the share of the way at which each hits (1: nothing), and what: -1 nothing, 0 the floor, then the bodies
+        that stand still, then people.
         """
-        share, number = np.ones(len(origins)), np.full(len(origins), -1)
+        names = {-1: -1, self.floor: 0} | {number: 1 + index for number, index in self.still.items()}
+        names |= {number: 1 + len(self.still) + person for number, person in self.owner.items()}
+        share, met = np.ones(len(origins)), np.full(len(origins), -1, np.int32)
         for first in range(0, len(origins), BATCH):
             part = slice(first, first + BATCH)
-            hits = p.rayTestBatch(origins[part], ends[part], numThreads=1, physicsClientId=self.client)
-            number[part], share[part] = [hit[0] for hit in hits], [hit[2] for hit in hits]
-        return share, number
+            hits = p.rayTestBatch(
+                origins[part].tolist(),
+                ends[part].tolist(),
+                numThreads=1,
+                collisionFilterMask=STILL_GROUP,
+                physicsClientId=self.client,
+            )
+            share[part], met[part] = [hit[2] for hit in hits], [names[hit[0]] for hit in hits]
+        return share, met
 
     def contacts(self) -> tuple[set[int], set[int]]:
         """Return the bodies that stand still, and the people, that the robot touches."""
