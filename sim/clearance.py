@@ -20,7 +20,7 @@ HEADROOM = 1.9  # metres: what hangs higher is in nobody's way
 
 
 class Clearance(NamedTuple):
-    """Distance to the nearest obstacle in metres, 0 inside; cell [row, column] is at x, y + resolution * (column, row)."""
+    """Metres to the nearest obstacle, 0 inside; cell [row, column] lies at (x, y) + resolution * (column, row)."""
 
     distance: Grid
     x: float
@@ -45,13 +45,13 @@ def clearance(bodies: list[Body], bounds: Bounds, resolution: float) -> Clearanc
     for body in bodies:
         for part in body.parts:
             if part.z - part.dz / 2 < HEADROOM:
-                _carve(free, part.footprint() - (bounds[0], bounds[1]), resolution)
+                carve(free, part.footprint() - (bounds[0], bounds[1]), resolution)
     free[[0, -1]] = False
     free[:, [0, -1]] = False
     return Clearance(distance_transform_edt(free) * resolution, bounds[0], bounds[1], resolution)
 
 
-def _carve(free: npt.NDArray[np.bool_], corners: Grid, resolution: float) -> None:
+def carve(free: npt.NDArray[np.bool_], corners: Grid, resolution: float) -> None:
     """Mark the cells whose centre lies in a convex polygon, or within half a cell of it, as taken."""
     low = np.maximum(np.floor(corners.min(0) / resolution).astype(int), 0)
     high = np.minimum(np.ceil(corners.max(0) / resolution).astype(int), np.array(free.shape[::-1]) - 1)

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sim.building import Building, BuildingError
-from sim.clearance import Clearance, clearance, route
+from sim.building import Building, BuildingError, TablePosition
+from sim.clearance import Clearance, carve, clearance, length_of, route
 from sim.furniture import TABLES, chair_body, table_body
 from sim.masonry import door_leaf, wall_bodies
 from sim.scenario import Scenario
-from sim.solids import Body
+from sim.solids import Body, Box, Truth
 
 Array = npt.NDArray[np.float64]
 
@@ -21,7 +21,9 @@ RESOLUTION = 0.05  # metres, of the grids of free floor
 ROBOT_RADIUS = 0.30  # metres: the circle around the robot's footprint, and a little
 NEAR_PATH = 0.8  # metres: doors this near to the tour's way stand open
 KEEP_CLEAR = 0.75  # metres between furniture and the way of the tour
-TARGET_CLEAR = 1.3  # metres between furniture and a target
+TARGET_CLEAR = 0.65  # metres between furniture and a target
+DETOUR = 1.1  # times the shortest way that a tour goes so as to pass the tables by
+WALL_CLEAR = 0.10  # metres between furniture and walls
 CLOSED_SHARE = 0.3  # of the doors that are on nobody's way
 CHAIR_MODELS = ("school", "dining", "slatted", "shell", "armchair", "sled")
 
@@ -46,48 +48,67 @@ class Layout(NamedTuple):
 def draw(building: Building, scenario: Scenario, tour: str, seed: int) -> Layout:
     """Draw one session's layout. Raises BuildingError if a target of the tour cannot be reached."""
     rng = np.random.default_rng([seed, 1])
-    walls = wall_bodies(building)
     bounds = building.bounds()
-    empty = clearance(walls, bounds, RESOLUTION)
-    way = _way(building, empty, tour)
-    leaves = _leaves(building, way, rng)
-    bodies = [*walls, *leaves]
-    seats: list[Seat] = []
+    walls = wall_bodies(building)
+    shell = walls + fixed_leaves(building)
+    empty = clearance(shell, bounds, RESOLUTION)
+    furnished = clearance(shell + _reserved(building), bounds, RESOLUTION)
+    way = tour_way(building, tour, empty, furnished)
+    bodies = [*walls, *_leaves(building, way, rng)]
     targets = np.array([building.start_pose(tour)[:2], *building.tours[tour].targets])
-    taken = clearance(bodies, bounds, RESOLUTION)
-    shares: dict[int, float] = {}
-    for place in building.tables:
-        room = building.room_of(place.at)
-        if room not in shares:
-            shares[room] = float(rng.uniform(*scenario.tables))
-        models = [name for name in (scenario.models or TABLES) if not place.models or name in place.models]
-        draws = rng.random(2)
-        if draws[0] >= shares[room] or not models:
-            continue
-        model = models[int(draws[1] * len(models))]
-        yaw = math.radians(place.heading) + float(rng.normal(0.0, 0.06))
-        x, y = np.array(place.at) + rng.normal(0.0, 0.08, 2)
-        table = table_body(model, float(x), float(y), yaw)
-        if not _fits(table, taken, way, targets, KEEP_CLEAR):
-            continue
-        bodies.append(table)
-        chairs, sitting = _chairs(model, float(x), float(y), yaw, taken, way, targets, scenario, rng)
-        bodies += chairs
+    site = _Site(clearance(bodies, bounds, RESOLUTION), way, targets)
+    seats: list[Seat] = []
+    chosen, spare = _filled(building, scenario, rng)
+    tables = 0
+    for place in chosen + spare:
+        if tables == len(chosen):
+            break
+        group, sitting = _group(place, site, scenario, rng)
+        tables += bool(group)
+        site.stand(group)
+        bodies += group
         seats += sitting
     return Layout(bodies, seats, clearance(bodies, bounds, RESOLUTION), way)
 
 
-def _way(building: Building, free: Clearance, tour: str) -> Array:
-    """Find the way of the robot from the start through all targets, all doors open."""
+def tour_way(building: Building, tour: str, empty: Clearance, furnished: Clearance | None = None) -> Array:
+    """Find the way (n, 2) of the robot from the start through all targets; past `furnished` tables where it can.
+
+    Raises BuildingError by tour and target where the empty building has no way.
+    """
     at = building.start_pose(tour)[:2]
     legs = []
     for index, target in enumerate(building.tours[tour].targets):
-        leg = route(free, at, target, radius=ROBOT_RADIUS)
+        leg = route(empty, at, target, radius=ROBOT_RADIUS)
         if leg is None:
             raise BuildingError(f"building {building.name}, tour {tour}: target {index} at {target} cannot be reached")
-        legs.append(leg)
+        around = None if furnished is None else route(furnished, at, target, radius=ROBOT_RADIUS)
+        longest = DETOUR * length_of(leg)
+        legs.append(leg if around is None or length_of(around) > longest else around)
         at = target
+    if not legs:
+        raise BuildingError(f"building {building.name}, tour {tour}: no targets")
     return np.concatenate(legs)
+
+
+def _reserved(building: Building) -> list[Body]:
+    """Return, for each table position, a body as large as a table with its chairs and the room to keep clear."""
+    bodies, room = [], 2 * (KEEP_CLEAR - ROBOT_RADIUS)
+    for place in building.tables:
+        dx, dy = (2.1, 2.1) if place.models and "conference" not in place.models else (3.2, 2.4)
+        box = Box(*place.at, 0.5, dx + room, dy + room, 1.0, math.radians(place.heading))
+        bodies.append(Body("table", Truth.TABLE, (box,)))
+    return bodies
+
+
+def fixed_leaves(building: Building) -> list[Body]:
+    """Return the leaves of the doors whose angle the building fixes."""
+    angles = [None if door.angle is None else _fixed(door.angle) for door in building.doors]
+    return [door_leaf(building, index, angle) for index, angle in enumerate(angles) if angle is not None]
+
+
+def _fixed(angle: float | str) -> float:
+    return 0.0 if angle == "closed" else math.radians(float(angle))
 
 
 def _leaves(building: Building, way: Array, rng: np.random.Generator) -> list[Body]:
@@ -97,7 +118,7 @@ def _leaves(building: Building, way: Array, rng: np.random.Generator) -> list[Bo
         draws = rng.random(2)
         middle = (np.array(door.hinge) + door.end()) / 2
         if door.angle is not None:
-            angle = 0.0 if door.angle == "closed" else math.radians(door.angle)
+            angle = _fixed(door.angle)
         elif np.linalg.norm(way - middle, axis=1).min() < NEAR_PATH:
             angle = math.radians(85.0 + 20.0 * draws[1])
         else:
@@ -106,22 +127,43 @@ def _leaves(building: Building, way: Array, rng: np.random.Generator) -> list[Bo
     return leaves
 
 
-def _chairs(
-    model: str,
-    x: float,
-    y: float,
-    yaw: float,
-    free: Clearance,
-    way: Array,
-    targets: Array,
-    scenario: Scenario,
-    rng: np.random.Generator,
+def _filled(
+    building: Building, scenario: Scenario, rng: np.random.Generator
+) -> tuple[list[TablePosition], list[TablePosition]]:
+    """Draw the positions that get a table, and those that stand in where no table fits.
+
+    Each gets one by the share of its room; their number is as near to the shares as can be.
+    """
+    shares = rng.uniform(*scenario.tables, len(building.rooms) + 1)  # the last: of no room
+    order = rng.permutation(len(building.tables))
+    reached = np.cumsum([shares[building.room_of(building.tables[index].at)] for index in order]) + rng.random()
+    filled = np.diff(np.floor(reached), prepend=0.0) >= 1.0
+    return [building.tables[index] for index in order[filled]], [building.tables[index] for index in order[~filled]]
+
+
+def _group(
+    place: TablePosition, site: _Site, scenario: Scenario, rng: np.random.Generator
 ) -> tuple[list[Body], list[Seat]]:
-    """Draw two to four chairs around a table, and who sits on them."""
+    """Draw a table for a position, of the first model that fits, two to four chairs around it, and who sits there."""
+    models = [name for name in (scenario.models or TABLES) if not place.models or name in place.models]
+    yaw = math.radians(place.heading) + float(rng.normal(0.0, 0.06))
+    x, y = (float(value) for value in np.array(place.at) + rng.normal(0.0, 0.08, 2))
+    for model in rng.permutation(models).tolist():
+        table = table_body(model, x, y, yaw)
+        if site.fits(table):
+            chairs, seats = _chairs(model, x, y, yaw, site, scenario, rng)
+            return [table, *chairs], seats
+    return [], []
+
+
+def _chairs(
+    model: str, x: float, y: float, yaw: float, site: _Site, scenario: Scenario, rng: np.random.Generator
+) -> tuple[list[Body], list[Seat]]:
+    wanted = int(rng.integers(2, 5))
+    chairs: list[Body] = []
+    seats: list[Seat] = []
     slots = TABLES[model].slots
-    order = rng.permutation(len(slots))[: int(rng.integers(2, 5))]
-    chairs, seats = [], []
-    for index in order:
+    for index in rng.permutation(len(slots)):
         slot = slots[index]
         kind = CHAIR_MODELS[int(rng.integers(len(CHAIR_MODELS)))]
         shift = rng.normal(0.0, [0.05, 0.05, 0.15])
@@ -130,30 +172,49 @@ def _chairs(
         at = place[0] + float(shift[0]), place[1] + float(shift[1])
         occupied = rng.random() < scenario.occupied
         chair = chair_body(kind, *at, turn)
-        if _fits(chair, free, way, targets, KEEP_CLEAR):
+        if len(chairs) < wanted and site.fits(chair):
             chairs.append(chair)
             if occupied:
                 seats.append(Seat(*at, turn))
     return chairs, seats
 
 
-def _fits(body: Body, free: Clearance, way: Array, targets: Array, keep: float) -> bool:
-    """Say whether a body stands clear of walls, doors, targets and the tour's way."""
-    corners = np.concatenate([part.footprint() for part in body.parts])
-    middle, reach = corners.mean(0), float(np.linalg.norm(corners - corners.mean(0), axis=1).max())
-    points = np.concatenate([corners, middle[None]])
-    if free.at(points).min() < 0.10:
-        return False
-    if np.linalg.norm(targets - middle, axis=1).min() < TARGET_CLEAR * 0.5 + reach:
-        return False
-    near = way[np.linalg.norm(way - middle, axis=1) < reach + keep]
-    return not len(near) or _distance(corners, near) > keep
+class _Site:
+    """Where furniture may still stand: clear of walls, doors, other furniture, targets and the tour's way."""
+
+    def __init__(self, free: Clearance, way: Array, targets: Array) -> None:
+        self.free, self.way, self.targets = free, way, targets
+        self.empty = np.ones(free.distance.shape, np.bool_)  # of furniture
+
+    def stand(self, bodies: list[Body]) -> None:
+        """Take the floor that some bodies need."""
+        for body in bodies:
+            for part in body.parts:
+                carve(self.empty, part.footprint() - (self.free.x, self.free.y), self.free.resolution)
+
+    def fits(self, body: Body) -> bool:
+        """Say whether a body may stand where it is."""
+        points = np.concatenate([sampled(part.footprint()) for part in body.parts])
+        if self.free.at(points).min() < WALL_CLEAR:
+            return False
+        cells = np.rint((points - (self.free.x, self.free.y)) / self.free.resolution).astype(int)
+        if not self.empty[cells[:, 1], cells[:, 0]].all():
+            return False
+        middle = points.mean(0)
+        reach = float(np.linalg.norm(points - middle, axis=1).max())
+        for places, keep in ((self.targets, TARGET_CLEAR), (self.way, KEEP_CLEAR)):
+            near = places[np.linalg.norm(places - middle, axis=1) < reach + keep]
+            if len(near) and np.linalg.norm(points[:, None] - near[None], axis=2).min() < keep:
+                return False
+        return True
 
 
-def _distance(corners: Array, points: Array) -> float:
-    """Return the least distance in metres between a body's outline, densely sampled, and some points."""
-    low, high = corners.min(0), corners.max(0)
-    steps = np.maximum(np.ceil((high - low) / 0.1).astype(int), 1)
-    x, y = np.meshgrid(np.linspace(low[0], high[0], steps[0] + 1), np.linspace(low[1], high[1], steps[1] + 1))
-    box = np.stack([x.ravel(), y.ravel()], 1)
-    return float(np.linalg.norm(box[:, None] - points[None], axis=2).min())
+def sampled(ring: Array) -> Array:
+    """Return points (n, 2) all over a convex polygon, about 0.1 m apart on its rim."""
+    following = np.roll(ring, -1, axis=0)
+    pieces = []
+    for a, b in zip(ring, following, strict=True):
+        shares = np.linspace(0.0, 1.0, max(int(np.linalg.norm(b - a) / 0.1), 1), endpoint=False)
+        pieces.append(a + shares[:, None] * (b - a))
+    rim, middle = np.concatenate(pieces), ring.mean(0)
+    return np.concatenate([middle + share * (rim - middle) for share in (0.0, 0.25, 0.5, 0.75, 1.0)])
