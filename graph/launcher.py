@@ -110,7 +110,7 @@ class Launcher:
         self.status = StatusLine([spec.name for spec in self.specs], quiet=quiet)
         self.children: dict[str, Child] = {}
         self.shards: list[Path] = []
-        self.ready: set[tuple[str, bool]] = set()
+        self.ready: set[str] = set()
         self.states: dict[str, State] = {}
         self.news_at = time.monotonic()
         self.reasons: list[str] = []
@@ -147,8 +147,8 @@ class Launcher:
     def _take(self, sample: Sample) -> None:
         kind, _, name = sample.key.partition("/")
         if kind == "ready" and sample.alive:
-            self.ready.add((name, True))
-            if self.children[name].incarnation > 0:  # brought back: the run is under way
+            self.ready.add(name)
+            if name in self.children and self.children[name].incarnation > 0:  # brought back: the run is under way
                 self.tell(Control("start", self.origin))
         elif kind == "state":
             state = msgspec.msgpack.decode(sample.payload, type=State)
@@ -159,26 +159,19 @@ class Launcher:
     def _look_after(self) -> None:
         for name, child in list(self.children.items()):
             code = child.ended()
-            if code in (None, 0):
+            if code is None or (code == 0 and self.leaving):
                 continue
             child.close()
-            spec = child.spec
-            how = (
-                f"was ended by signal {-code} ({signal.Signals(-code).name})"
-                if code < 0
-                else f"failed (exit code {code})"
-            )
-            if (
-                self.realtime
-                and spec.restart == "on-failure"
-                and name in {ready for ready, _ in self.ready}
-                and not self.stopping
-            ):
-                self.status.say(f"{name} {how}; starting it again")
-                self.spawn(spec, child.incarnation + 1)
-                continue
-            self.reasons.append(f"{name} {how}")
-            raise Failure(f"{name} {how}")
+            how = f"{name} {_ending(code)}"
+            if child.spec.kind == "sink":
+                self.status.say(f"{how}; the run goes on without it")
+                del self.children[name]
+            elif self.realtime and child.spec.restart == "on-failure" and name in self.ready and not self.stopping:
+                self.status.say(f"{how}; starting it again")
+                self.spawn(child.spec, child.incarnation + 1)
+            else:
+                self.reasons.append(how)
+                raise Failure(how)
 
     # phases
 
@@ -189,7 +182,7 @@ class Launcher:
         before = signal.signal(signal.SIGINT, self._interrupted)
         terminate = signal.signal(signal.SIGTERM, self._interrupted)
         begin = time.monotonic()
-        self.stopping = False
+        self.stopping = self.leaving = False
         self.origin = 0
         try:
             with Wire(self.endpoint, self.prefix, router=True) as self.wire:
@@ -218,8 +211,7 @@ class Launcher:
         """Start all processes; nothing begins before every one has declared its ports."""
         for spec in self.specs:
             self.spawn(spec)
-        names = {spec.name for spec in self.specs}
-        while (waiting := names - {name for name, _ in self.ready}) and not self.interrupts:
+        while (waiting := set(self.children) - self.ready) and not self.interrupts:
             self.status.phase = f"starting {', '.join(sorted(waiting))} (the first start compiles, for a minute or so)"
             self.listen(POLL)
         if self.interrupts:
@@ -315,7 +307,7 @@ class Launcher:
 
     def _finish(self) -> None:
         """Let every process go: only now, since others may have been reading their memory."""
-        self.stopping = True
+        self.stopping = self.leaving = True
         self.tell(Control("exit"))
         deadline = time.monotonic() + LEAVE
         while any(child.ended() is None for child in self.children.values()):
@@ -340,6 +332,12 @@ class Launcher:
         )
         shutil.rmtree(self.paths.shards)
         return Outcome(verdict, self.paths.recording, verdict.end / 1e9, wall, self.status.statistics())
+
+
+def _ending(code: int) -> str:
+    if code < 0:
+        return f"was ended by signal {-code} ({signal.Signals(-code).name})"
+    return f"failed (exit code {code})" if code else "left before the end"
 
 
 class Failure(Exception):

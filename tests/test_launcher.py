@@ -261,6 +261,16 @@ def _files(process: psutil.Process) -> list[Path]:
     return [Path(item.path) for item in process.open_files()]
 
 
+def test_a_sink_that_dies_holds_back_nobody(graph_file: Write, tmp_path: Path) -> None:
+    text = SLOW_CHAIN.replace("100000", "100") + (
+        "  screen: {run: tests.trial_operators:Stumbling, inputs: {count: counter/count}}\n"
+    )
+    code, out, err = run(graph_file(text), tmp_path / "run.mcap")
+    assert code == 0, out + err
+    assert "screen failed (exit code 1); the run goes on without it" in err
+    assert Recording(tmp_path / "run.mcap").verdict.verdict == "COMPLETE"
+
+
 def test_live_operators_run_with_recorded_ones(graph_file: Write, tmp_path: Path) -> None:
     graph, path = graph_file(), tmp_path / "run.mcap"
     assert run(graph, path, "--in-process")[0] == 0

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import msgspec
 
-from graph import End, Operator, Source
+from graph import End, Operator, Sink, Source
 from graph.messages import Tick
 from tests.sample_operators import Count
 
@@ -105,3 +105,10 @@ class MixerSource(_Mixing, Source):
     def stream(self) -> Iterator[tuple[int, list[MixerOutputs | End]]]:
         for stamp in self.config.stamps:
             yield stamp, list(self.mix(0, stamp))
+
+
+class Stumbling(Sink):
+    """Fail at the first number."""
+
+    def on_count(self, count: Count) -> None:
+        raise RuntimeError("a sink that stumbles")
