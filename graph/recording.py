@@ -123,6 +123,16 @@ def read_records(stream: IO[bytes], *, chunks: bool = False) -> Iterator[McapRec
     yield from reader.records
 
 
+def _record_at(stream: IO[bytes], place: int, kind: type[Record]) -> Record:
+    """Read the record at a place that the index names. Raises ValueError if another kind of record stands there."""
+    stream.seek(place)
+    reader = StreamReader(_Exact(stream), skip_magic=True, emit_chunks=True)  # type: ignore[arg-type]
+    record = next(iter(reader.records))
+    if not isinstance(record, kind):
+        raise ValueError(f"at byte {place} stands no {kind.__name__}")
+    return record
+
+
 def seal(record: msgspec.Struct) -> dict[str, str]:
     """Make a metadata record of a struct, with its digest, since MCAP puts no checksum on metadata."""
     text = msgspec.json.encode(record)
@@ -195,7 +205,7 @@ class Recording:
                 raise RecordingError(f"{self.path} is empty; a recording is an MCAP file")
             if head != MAGIC:
                 raise RecordingError(f"{self.path} is not an MCAP file: it does not begin as one does")
-            self.metadata, self.types, self.counts = self._read_index(stream, size)
+            self._read_index(stream, size)
         for name in (RUN, VERDICT):
             if name not in self.metadata:
                 raise RecordingError(f"{self.path} is an MCAP file, but not a recording of retracer: no {name} record")
@@ -205,10 +215,8 @@ class Recording:
         except RecordingError as error:
             raise RecordingError(f"{self.path}: {error}") from None
 
-    def _read_index(
-        self, stream: IO[bytes], size: int
-    ) -> tuple[dict[str, dict[str, str]], dict[str, tuple[str, str]], dict[str, int]]:
-        """Read metadata, topic types and message counts by the summary section, whose CRC must be right."""
+    def _read_index(self, stream: IO[bytes], size: int) -> None:
+        """Read what is where, and the metadata, by the summary section, whose CRC must be right."""
         stream.seek(max(0, size - _FOOTER_BYTES))
         tail = stream.read(_FOOTER_BYTES)
         if size < _FOOTER_BYTES + len(MAGIC) or not tail.endswith(MAGIC) or tail[0] != 2:
@@ -220,35 +228,37 @@ class Recording:
         summary = stream.read(size - start - _FOOTER_BYTES)
         if zlib.crc32(summary + tail[: 9 + 16]) != crc:
             raise _complaint(self.path, ValueError("the checksum of its index does not fit"))
-        channels = Channels()
-        places: list[int] = []
-        counts: dict[str, int] = {}
+        self.channels = Channels()
+        self.types = self.channels.types  # topic: (type name, JSON Schema)
+        self.counts: dict[str, int] = {}  # topic: messages
+        self.metadata: dict[str, dict[str, str]] = {}
+        self._chunks: list[int] = []
+        self._attachments: list[int] = []
         topics: dict[int, str] = {}
         try:
             reader = StreamReader(io.BytesIO(summary + tail), skip_magic=True)
             for record in reader.records:
                 if isinstance(record, Channel) and "operator" not in record.metadata:
                     continue
-                channels.take(record)
+                self.channels.take(record)
                 if isinstance(record, Channel):
                     topics[record.id] = record.topic
-                if isinstance(record, MetadataIndex):
-                    places.append(record.offset)
-                if isinstance(record, Statistics):
+                elif isinstance(record, ChunkIndex):
+                    self._chunks.append(record.chunk_start_offset)
+                elif isinstance(record, AttachmentIndex):
+                    self._attachments.append(record.offset)
+                elif isinstance(record, MetadataIndex):
+                    place = _record_at(stream, record.offset, Metadata)
+                    self.metadata[place.name] = place.metadata
+                elif isinstance(record, Statistics):
                     for channel, count in record.channel_message_counts.items():
                         if channel in topics:
-                            counts[topics[channel]] = counts.get(topics[channel], 0) + count
-            metadata = {}
-            for place in places:
-                stream.seek(place)
-                record = next(iter(StreamReader(_Exact(stream), skip_magic=True).records))  # type: ignore[arg-type]
-                if isinstance(record, Metadata):
-                    metadata[record.name] = record.metadata
+                            self.counts[topics[channel]] = self.counts.get(topics[channel], 0) + count
         except RecordingError:
             raise
         except Exception as error:
             raise _complaint(self.path, error) from error
-        return metadata, channels.types, counts
+        self._chunks.sort()
 
     @functools.cached_property
     def graph(self) -> Graph:
@@ -260,23 +270,14 @@ class Recording:
 
         Raises RecordingError where the file is damaged.
         """
-        channels = Channels()
-        whole = False
-        try:
-            with self.path.open("rb") as stream:
-                for record in read_records(stream):
-                    if isinstance(record, Message):
-                        yield channels.entry(record)
-                    elif isinstance(record, Header) and not record.profile.startswith(PROFILE):
-                        raise RecordingError("it is no recording of retracer")
-                    elif isinstance(record, Footer):
-                        whole = True
-                    elif isinstance(record, (Schema, Channel)) and not whole:
-                        channels.take(record)
-        except (RecordingError, GeneratorExit):
-            raise
-        except Exception as error:
-            raise _complaint(self.path, error) from error
+        with self.path.open("rb") as stream:
+            for place in self._chunks:
+                try:
+                    records = breakup_chunk(_record_at(stream, place, Chunk), validate_crc=True)
+                    found = [self.channels.entry(record) for record in records if isinstance(record, Message)]
+                except Exception as error:
+                    raise _complaint(self.path, error) from error
+                yield from found
 
     def messages(self, *topics: str) -> Iterator[Entry]:
         """Iterate over the messages of some topics (`operator/port`), or of all ports if none is named."""
@@ -299,9 +300,14 @@ class Recording:
     def attachments(self) -> Iterator[Attachment]:
         """Iterate over the attachments: the log of each operator."""
         with self.path.open("rb") as stream:
-            for record in read_records(stream, chunks=True):
-                if isinstance(record, Attachment):
-                    yield record
+            for place in self._attachments:
+                try:
+                    record = _record_at(stream, place, Attachment)
+                    if zlib.crc32(bytes_of(record)[9:-4]) != struct.unpack("<I", stream.read(4))[0]:
+                        raise ValueError(f"the checksum of {record.name} does not fit")
+                except Exception as error:
+                    raise _complaint(self.path, error) from error
+                yield record
 
     def require_ledger(self) -> None:
         """Raise RecordingError if the ledger is of another version."""
