@@ -73,7 +73,8 @@ class Segmenter(Counted):
 
     def on_frame(self, frame: PointCloud) -> Counted.Outputs:
         """Subsample and classify a frame."""
-        result = self.classifier.classify(frame.points, frame.base_from_lidar, frame.ring)
+        full = self.config.full
+        result = self.classifier.classify(frame.points, frame.base_from_lidar, frame.ring, full=full)
         classified = PointCloud(
             measured_at=frame.measured_at,
             points=result.points,
@@ -84,7 +85,7 @@ class Segmenter(Counted):
             scores=result.scores,
         )
         self.count(classified)
-        if not self.config.full:
+        if not full:
             return self.Outputs(classified)
         labels, scores = result.full()
         return self.Outputs(classified, msgspec.structs.replace(frame, label=labels, scores=scores))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast
 
 import numpy as np
@@ -13,12 +14,13 @@ from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, types
 from numba.extending import intrinsic
 
+from operators.kpconv.crew import side_by_side
 from operators.kpconv.grid import Floats, Ints
 from operators.kpconv.links import Bytes
 
 Halves = npt.NDArray[np.uint16]  # bfloat16: the upper half of a float32
 
-FEW = 512  # rows that are not worth a second thread
+FEW = 4  # rows or channels that are not worth a second thread
 
 
 @intrinsic
@@ -130,24 +132,15 @@ def scatter_largest(winners: Ints, gradient: Floats, out: Floats, begin: int, en
                 out[winners[q, c], c] += gradient[q, c]
 
 
-_crews: dict[int, ThreadPoolExecutor] = {}
-
-
 def split(kernel: Callable[..., None], count: int, *arguments: Any) -> None:
     """Run kernel(*arguments, begin, end) over 0..count, in as many parts as torch has threads in this thread.
 
     Each part writes its own rows or channels, so that the number of parts changes no bit.
     """
-    threads = torch.get_num_threads()
-    if threads == 1 or count < threads:
-        kernel(*arguments, 0, count)
-        return
-    crew = _crews.setdefault(threads, ThreadPoolExecutor(threads - 1, thread_name_prefix="kpconv"))
+    threads = torch.get_num_threads() if count >= FEW else 1
     bounds = [count * part // threads for part in range(threads + 1)]
-    rest = [crew.submit(kernel, *arguments, bounds[part], bounds[part + 1]) for part in range(1, threads)]
-    kernel(*arguments, 0, bounds[1])
-    for part in rest:
-        part.result()
+    parts = itertools.pairwise(bounds)
+    side_by_side([functools.partial(kernel, *arguments, begin, end) for begin, end in parts], threads)
 
 
 class Matrix:

@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from graph.geometry import transform
-from operators.kpconv.grid import NONE, Floats, Grid, Ints, nearest, subsample
+from operators.kpconv.grid import NONE, Floats, Grid, Ints, closest_members, nearest, subsample
 from operators.kpconv.inference import FastKPFCNN, best_precision
 from operators.kpconv.links import Bytes
 from operators.kpconv.network import KPFCNN
@@ -34,7 +34,7 @@ class Classified(NamedTuple):
     scores: Floats  # (m, 4) probability of labels 1 to 4
     source: Ints  # (m,) of each voxel the point nearest to its barycentre
     table: Floats  # (t, 4) scores, of which each point of the frame has one row:
-    rows: Ints  # (n,) or -1 for points that no network was asked about
+    rows: Ints  # (n,) or -1 for points that no network was asked about; none at all where they were not wanted
 
     @property
     def labels(self) -> Bytes:
@@ -70,10 +70,12 @@ class Classifier(Protocol):
     def infer(self, prepared: Prepared) -> Floats:
         """Return the scores (t, 4) of what the network sees."""
 
-    def finish(self, prepared: Prepared, table: Floats) -> Classified:
-        """Bring the scores back to the points."""
+    def finish(self, prepared: Prepared, table: Floats, *, full: bool = True) -> Classified:
+        """Bring the scores back to the points; full: also to all points of the frame."""
 
-    def classify(self, points: Floats, base_from_lidar: npt.NDArray[Any], ring: Bytes | None = None) -> Classified:
+    def classify(
+        self, points: Floats, base_from_lidar: npt.NDArray[Any], ring: Bytes | None = None, *, full: bool = True
+    ) -> Classified:
         """Classify points (n, 3) in the lidar's frame."""
 
 
@@ -87,16 +89,6 @@ def in_lidar_frame(points_base: Floats, base_from_lidar: npt.NDArray[np.float64]
     return transform(np.linalg.inv(base_from_lidar), points_base)
 
 
-def sources_of(grid: Grid, rows: Ints, points: Floats) -> Ints:
-    """Return the point (m,) of each voxel that is nearest to its barycentre; of equal ones the first."""
-    known = np.flatnonzero(rows != NONE)
-    square = ((points[known] - grid.points[rows[known]]) ** 2).sum(1)
-    order = known[np.lexsort((-known, -square))]
-    source = np.full(len(grid.points), NONE, np.int32)
-    source[rows[order]] = order  # the last one written is the nearest
-    return source
-
-
 class KPConvClassifier:
     """A KPFCNN that classifies frames."""
 
@@ -108,7 +100,7 @@ class KPConvClassifier:
         """Subsample points (n, 3) of the lidar's frame, and build the pyramid."""
         points_base = transform(base_from_lidar, points)
         grid, rows = subsample(points_base, self.settings.voxel)
-        pyramid = build(grid, self.settings.geometry)
+        pyramid = build(grid, self.settings.geometry, torch.get_num_threads())
         return Prepared((pyramid, inputs_of(grid.points)), grid, rows, points_base, base_from_lidar)
 
     def infer(self, prepared: Prepared) -> Floats:
@@ -116,21 +108,23 @@ class KPConvClassifier:
         pyramid: Pyramid = prepared.given[0]
         return self.network(*prepared.given) if len(pyramid.points[0]) else np.zeros((0, len(CLASSES)), np.float32)
 
-    def finish(self, prepared: Prepared, table: Floats) -> Classified:
+    def finish(self, prepared: Prepared, table: Floats, *, full: bool = True) -> Classified:
         """Give each point the scores of the nearest subsampled one."""
         grid, rows, points = prepared.grid, prepared.voxel_rows, prepared.points_base
         return Classified(
             in_lidar_frame(grid.points, prepared.base_from_lidar),
             table,
-            sources_of(grid, rows, points),
+            closest_members(grid, points, rows),
             table,
-            nearest(grid, points, rows),
+            nearest(grid, points, rows) if full else np.zeros(0, np.int32),
         )
 
-    def classify(self, points: Floats, base_from_lidar: npt.NDArray[Any], ring: Bytes | None = None) -> Classified:
+    def classify(
+        self, points: Floats, base_from_lidar: npt.NDArray[Any], ring: Bytes | None = None, *, full: bool = True
+    ) -> Classified:
         """Classify points (n, 3) in the lidar's frame."""
         prepared = self.prepare(points, base_from_lidar, ring)
-        return self.finish(prepared, self.infer(prepared))
+        return self.finish(prepared, self.infer(prepared), full=full)
 
 
 class RangeClassifier:
@@ -155,19 +149,21 @@ class RangeClassifier:
         """Return the scores of the pixels, row by row."""
         return self.network(prepared.given[0].image)
 
-    def finish(self, prepared: Prepared, table: Floats) -> Classified:
+    def finish(self, prepared: Prepared, table: Floats, *, full: bool = True) -> Classified:
         """Give each point the scores of a pixel, and each voxel those of the point nearest to its barycentre."""
         shown, level, good = prepared.given
         rows = np.full(len(prepared.points_base), NONE, np.int32)
         rows[good] = back_project(level, shown.winners, shown.row, shown.column)
-        source = sources_of(prepared.grid, prepared.voxel_rows, prepared.points_base)
+        source = closest_members(prepared.grid, prepared.points_base, prepared.voxel_rows)
         points = in_lidar_frame(prepared.grid.points, prepared.base_from_lidar)
         return Classified(points, table[rows[source]], source, table, rows)
 
-    def classify(self, points: Floats, base_from_lidar: npt.NDArray[Any], ring: Bytes | None = None) -> Classified:
+    def classify(
+        self, points: Floats, base_from_lidar: npt.NDArray[Any], ring: Bytes | None = None, *, full: bool = True
+    ) -> Classified:
         """Classify points (n, 3) in the lidar's frame."""
         prepared = self.prepare(points, base_from_lidar, ring)
-        return self.finish(prepared, self.infer(prepared))
+        return self.finish(prepared, self.infer(prepared), full=full)
 
 
 def classifier_of(network: nn.Module, settings: Settings, precision: torch.dtype | None = None) -> Classifier:

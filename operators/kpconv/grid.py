@@ -27,11 +27,13 @@ FINE = 1 << 20  # fixed-point steps a voxel edge
 
 
 class Grid(NamedTuple):
-    """The barycentres of the occupied voxels, sorted by cell, and a hash table of the cells."""
+    """The barycentres of the occupied voxels, sorted by cell (x, then y, then z), and a hash table of the columns."""
 
     points: Floats  # (m, 3) metres
-    cell_keys: Longs  # open addressing: key, or -1
-    cell_bounds: Ints  # (slots, 2) first point of the cell and the one after its last
+    cell_heights: Ints  # (cells,) vertical coordinate of each occupied cell
+    cell_starts: Ints  # (cells + 1,) first point of each cell
+    column_keys: Longs  # open addressing: key of a column of cells, or -1
+    column_bounds: Ints  # (slots, 2) first cell of the column and the one after its last
     cell_size: float  # metres
 
 
@@ -95,8 +97,8 @@ def collect(points: Floats, size: float) -> tuple[Longs, Ints, Longs, Longs, Int
 @njit(cache=True, nogil=True, error_model="numpy")
 def arrange(
     order: Longs, keys: Longs, places: Ints, sums: Longs, sizes: Longs, size: float
-) -> tuple[Floats, Longs, Ints, Ints]:
-    """Return barycentres (m, 3) in the given order of the voxels, the table of their cells, and each voxel's rank."""
+) -> tuple[Floats, Ints, Ints, Longs, Ints, Ints]:
+    """Return barycentres (m, 3) in the given order of the voxels, the other arrays of a Grid, and each voxel's rank."""
     count = len(order)
     points = np.empty((count, 3), np.float32)
     ranks = np.empty(count, np.int32)
@@ -104,25 +106,34 @@ def arrange(
     while slots < 2 * count:
         slots *= 2
     mask = slots - 1
-    cell_keys = np.full(slots, NONE, np.int64)
-    cell_bounds = np.empty((slots, 2), np.int32)
-    last_key, slot = NONE, 0
+    cell_heights, cell_starts = np.empty(count, np.int32), np.empty(count + 1, np.int32)
+    column_keys = np.full(slots, NONE, np.int64)
+    column_bounds = np.empty((slots, 2), np.int32)
+    last_cell, last_column, slot, cells = NONE, NONE, 0, 0
     for rank in range(count):
         number = order[rank]
         ranks[number] = rank
         for axis in range(3):
             inner = (sums[number, axis] + 0.5 * sizes[number]) / (sizes[number] * FINE)
             points[rank, axis] = np.float32((places[number, axis] + inner) * size)
-        key = keys[number] >> LOCAL
-        if key != last_key:
-            last_key = key
-            slot = spread(key, mask)
-            while cell_keys[slot] != NONE:
+        cell = keys[number] >> LOCAL
+        if cell == last_cell:
+            continue
+        last_cell = cell
+        column = cell >> FIELD
+        if column != last_column:
+            last_column = column
+            slot = spread(column, mask)
+            while column_keys[slot] != NONE:
                 slot = (slot + 1) & mask
-            cell_keys[slot] = key
-            cell_bounds[slot, 0] = rank
-        cell_bounds[slot, 1] = rank + 1
-    return points, cell_keys, cell_bounds, ranks
+            column_keys[slot] = column
+            column_bounds[slot, 0] = cells
+        cell_heights[cells] = places[number, 2] // CELL
+        cell_starts[cells] = rank
+        cells += 1
+        column_bounds[slot, 1] = cells
+    cell_starts[cells] = count
+    return points, cell_heights[:cells], cell_starts[: cells + 1], column_keys, column_bounds, ranks
 
 
 def subsample(points: npt.NDArray[Any], size: float) -> tuple[Grid, Ints]:
@@ -133,22 +144,28 @@ def subsample(points: npt.NDArray[Any], size: float) -> tuple[Grid, Ints]:
     """
     keys, places, sums, sizes, voxel_of = collect(np.ascontiguousarray(points, np.float32), size)
     order = np.argsort(keys)  # keys are unique
-    barycentres, cell_keys, cell_bounds, ranks = arrange(order, keys, places, sums, sizes, size)
+    barycentres, heights, starts, columns, bounds, ranks = arrange(order, keys, places, sums, sizes, size)
     rows = np.where(voxel_of == NONE, np.int32(NONE), ranks[voxel_of]) if len(ranks) else voxel_of
-    return Grid(barycentres, cell_keys, cell_bounds, CELL * size), rows
+    return Grid(barycentres, heights, starts, columns, bounds, CELL * size), rows
 
 
 @njit(cache=True, nogil=True)
-def bounds_of(grid: Grid, i: int, j: int, k: int) -> tuple[int, int]:
-    """Return the first point of a cell and the one after its last; equal where the cell is empty."""
-    key = cell_key(i, j, k)
-    mask = len(grid.cell_keys) - 1
+def run_of(grid: Grid, i: int, j: int, lowest: int, highest: int) -> tuple[int, int]:
+    """Return the first point of cells (i, j, lowest..highest) and the one after the last; equal where there is none."""
+    key = ((i + HALF) << FIELD) | (j + HALF)
+    mask = len(grid.column_keys) - 1
     slot = spread(key, mask)
-    while grid.cell_keys[slot] != key:
-        if grid.cell_keys[slot] == NONE:
+    while grid.column_keys[slot] != key:
+        if grid.column_keys[slot] == NONE:
             return 0, 0
         slot = (slot + 1) & mask
-    return int(grid.cell_bounds[slot, 0]), int(grid.cell_bounds[slot, 1])
+    cell, after = grid.column_bounds[slot, 0], grid.column_bounds[slot, 1]
+    while cell < after and grid.cell_heights[cell] < lowest:
+        cell += 1
+    end = cell
+    while end < after and grid.cell_heights[end] <= highest:
+        end += 1
+    return int(grid.cell_starts[cell]), int(grid.cell_starts[end])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -163,16 +180,16 @@ def fill_nearest(grid: Grid, queries: Floats, rows: Ints, begin: int, end: int) 
         dx, dy, dz = cloud[row, 0] - x, cloud[row, 1] - y, cloud[row, 2] - z
         best = dx * dx + dy * dy + dz * dz
         reach = math.sqrt(best)
+        lowest, highest = math.floor((z - reach) / size), math.floor((z + reach) / size)
         # cells that the sphere through the near point touches; mostly one
         for i in range(math.floor((x - reach) / size), math.floor((x + reach) / size) + 1):
             for j in range(math.floor((y - reach) / size), math.floor((y + reach) / size) + 1):
-                for k in range(math.floor((z - reach) / size), math.floor((z + reach) / size) + 1):
-                    first, after = bounds_of(grid, i, j, k)
-                    for p in range(first, after):
-                        dx, dy, dz = cloud[p, 0] - x, cloud[p, 1] - y, cloud[p, 2] - z
-                        square = dx * dx + dy * dy + dz * dz
-                        if square < best or (square == best and p < row):
-                            best, row = square, p
+                first, after = run_of(grid, i, j, lowest, highest)
+                for p in range(first, after):
+                    dx, dy, dz = cloud[p, 0] - x, cloud[p, 1] - y, cloud[p, 2] - z
+                    square = dx * dx + dy * dy + dz * dz
+                    if square < best or (square == best and p < row):
+                        best, row = square, p
         rows[q] = row
 
 
@@ -184,3 +201,23 @@ def nearest(grid: Grid, queries: npt.NDArray[Any], near: Ints) -> Ints:
     rows = near.copy()
     fill_nearest(grid, np.ascontiguousarray(queries, np.float32), rows, 0, len(queries))
     return rows
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def closest_members(grid: Grid, points: Floats, rows: Ints) -> Ints:
+    """Return for each grid point (m,) the one of its own points (n, 3) that is nearest to it; of equal ones the first.
+
+    rows: (n,) the grid point that each point belongs to, or -1.
+    """
+    source = np.full(len(grid.points), NONE, np.int32)
+    least = np.full(len(grid.points), np.inf, np.float32)
+    for n in range(len(points)):
+        row = rows[n]
+        if row == NONE:
+            continue
+        dx, dy = grid.points[row, 0] - points[n, 0], grid.points[row, 1] - points[n, 1]
+        dz = grid.points[row, 2] - points[n, 2]
+        square = np.float32(dx * dx + dy * dy + dz * dz)
+        if square < least[row]:
+            least[row], source[row] = square, n
+    return source

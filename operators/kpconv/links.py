@@ -17,7 +17,7 @@ import numpy.typing as npt
 from numba import njit
 
 from operators.kpconv.disposition import kernel_points
-from operators.kpconv.grid import Floats, Grid, Ints, bounds_of
+from operators.kpconv.grid import Floats, Grid, Ints, run_of
 
 Bytes = npt.NDArray[np.uint8]
 
@@ -81,13 +81,13 @@ def connect(
     """
     listed = len(neighbour_starts) > 0
     size, cloud = grid.cell_size, grid.points
-    first, after = np.empty(27, np.int64), np.empty(27, np.int64)
+    first, after = np.empty(9, np.int64), np.empty(9, np.int64)
     near = np.empty(len(cloud), np.int32)  # neighbours of the query at hand
     offsets = np.empty((len(cloud), 3), np.float32)  # in radii
     limit, scale = np.float32(radius * radius), np.float32(1.0 / radius)
     reach, per_extent = np.float32(kernel.extent * kernel.extent), np.float32(1.0 / kernel.extent)
     half, most = np.float32(BOXES / 2), BOXES - 1
-    cells, last_i, last_j, last_k = 0, 0, 0, 0
+    runs, last_i, last_j, last_k = 0, 0, 0, 0
     known = False
     entries = starts[begin]
     pairs = neighbour_starts[begin] if listed else 0
@@ -95,15 +95,15 @@ def connect(
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
         i, j, k = math.floor(x / size), math.floor(y / size), math.floor(z / size)
         if not known or i != last_i or j != last_j or k != last_k:
-            known, last_i, last_j, last_k, cells = True, i, j, k, 0
-            for code in range(27):
-                a, b = bounds_of(grid, i + code // 9 - 1, j + (code // 3) % 3 - 1, k + code % 3 - 1)
+            known, last_i, last_j, last_k, runs = True, i, j, k, 0
+            for code in range(9):
+                a, b = run_of(grid, i + code // 3 - 1, j + code % 3 - 1, k - 1, k + 1)
                 if a < b:
-                    first[cells], after[cells] = a, b
-                    cells += 1
+                    first[runs], after[runs] = a, b
+                    runs += 1
         own = 0
-        for cell in range(cells):
-            for n in range(first[cell], after[cell]):
+        for run in range(runs):
+            for n in range(first[run], after[run]):
                 dx, dy, dz = cloud[n, 0] - x, cloud[n, 1] - y, cloud[n, 2] - z
                 near[own] = n
                 offsets[own, 0], offsets[own, 1], offsets[own, 2] = dx * scale, dy * scale, dz * scale

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from operators.kpconv.crew import side_by_side
 from operators.kpconv.grid import Floats, Grid, Ints, nearest, subsample
 from operators.kpconv.links import Links, kernel_of, link
 
@@ -31,20 +33,32 @@ class Pyramid(NamedTuple):
     parents: tuple[Ints, ...]  # (m_l,) nearest point of level l + 1
 
 
-def build(grid: Grid, geometry: Geometry) -> Pyramid:
-    """Build the pyramid on a grid of voxels of `geometry.voxel` metres."""
+def build(grid: Grid, geometry: Geometry, threads: int = 1) -> Pyramid:
+    """Build the pyramid on a grid of voxels of `geometry.voxel` metres, on so many threads."""
     kernel = kernel_of(geometry.kernel_points, geometry.extent / geometry.radius)
-    points, convolutions, pools, parents = [grid.points], [], [], []
-    for level in range(geometry.levels):
-        size = geometry.voxel * 2**level
-        convolutions.append(link(grid, grid.points, radius=geometry.radius * size, kernel=kernel))
+    sizes = [geometry.voxel * 2**level for level in range(geometry.levels)]
+    grids, ranks = [grid], []
+    for size in sizes[1:]:
+        coarser, rank = subsample(grids[-1].points, size)
+        grids.append(coarser)
+        ranks.append(rank)
+    convolutions: list[Callable[[], Any]] = []
+    pools: list[Callable[[], Any]] = []
+    parents: list[Callable[[], Any]] = []
+    for level, (own, size) in enumerate(zip(grids, sizes, strict=True)):
+        linked = functools.partial(link, own, radius=geometry.radius * size, kernel=kernel)
+        convolutions.append(functools.partial(linked, own.points))
         if level + 1 < geometry.levels:
-            coarser, ranks = subsample(grid.points, 2 * size)
-            pools.append(link(grid, coarser.points, radius=geometry.radius * size, kernel=kernel, listed=True))
-            parents.append(nearest(coarser, grid.points, ranks))
-            points.append(coarser.points)
-            grid = coarser
-    return Pyramid(tuple(points), tuple(convolutions), tuple(pools), tuple(parents))
+            pools.append(functools.partial(linked, grids[level + 1].points, listed=True))
+            parents.append(functools.partial(nearest, grids[level + 1], own.points, ranks[level]))
+    done = side_by_side([*convolutions, *pools, *parents], threads)
+    count = geometry.levels
+    return Pyramid(
+        tuple(own.points for own in grids),
+        tuple(done[:count]),
+        tuple(done[count : 2 * count - 1]),
+        tuple(done[2 * count - 1 :]),
+    )
 
 
 def offset(parts: Sequence[npt.NDArray[Any]], first: npt.NDArray[np.int64], *, head: bool = False) -> Ints:
