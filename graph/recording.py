@@ -8,15 +8,17 @@ import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any, NamedTuple, TypeVar
 
 import msgspec
 from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
+    AttachmentIndex,
     Channel,
-    Footer,
-    Header,
+    Chunk,
+    ChunkIndex,
     McapRecord,
     Message,
     Metadata,
@@ -24,7 +26,7 @@ from mcap.records import (
     Schema,
     Statistics,
 )
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import StreamReader, breakup_chunk
 
 from graph.codec import digest
 from graph.errors import UserError
@@ -39,6 +41,8 @@ RUN, VERDICT = "retracer.run", "retracer.verdict"  # metadata records: written f
 FORMAT = 1
 
 _FOOTER_BYTES = 1 + 8 + 20 + len(MAGIC)
+
+Record = TypeVar("Record", bound=McapRecord)
 
 _step_decoder = msgspec.msgpack.Decoder(Step)
 
@@ -113,11 +117,9 @@ class _Exact:
         return data if len(data) == size else b""
 
 
-def read_records(stream: IO[bytes], *, chunks: bool = False) -> Iterator[McapRecord]:
-    """Iterate over the records of an MCAP stream, checking chunk CRCs. Raises what is wrong where it is wrong."""
-    reader = StreamReader(_Exact(stream), emit_chunks=chunks, record_size_limit=2 << 30)  # type: ignore[arg-type]
-    reader._validate_crcs = True  # of chunks; the running CRC of the whole data section would cost as much again
-    reader._skip_magic = True
+def read_records(stream: IO[bytes]) -> Iterator[McapRecord]:
+    """Iterate over the records of a shard, which has no chunks. Raises what is wrong where it is wrong."""
+    reader = StreamReader(_Exact(stream), skip_magic=True, record_size_limit=2 << 30)  # type: ignore[arg-type]
     if stream.read(len(MAGIC)) != MAGIC:
         raise RecordingError("it does not begin as an MCAP file does")
     yield from reader.records
@@ -126,8 +128,10 @@ def read_records(stream: IO[bytes], *, chunks: bool = False) -> Iterator[McapRec
 def _record_at(stream: IO[bytes], place: int, kind: type[Record]) -> Record:
     """Read the record at a place that the index names. Raises ValueError if another kind of record stands there."""
     stream.seek(place)
+    opcode = stream.read(1)
+    stream.seek(place)
     reader = StreamReader(_Exact(stream), skip_magic=True, emit_chunks=True)  # type: ignore[arg-type]
-    record = next(iter(reader.records))
+    record = next(iter(reader.records)) if opcode == bytes([Opcode[kind.__name__.upper()]]) else None
     if not isinstance(record, kind):
         raise ValueError(f"at byte {place} stands no {kind.__name__}")
     return record
@@ -233,7 +237,7 @@ class Recording:
         self.counts: dict[str, int] = {}  # topic: messages
         self.metadata: dict[str, dict[str, str]] = {}
         self._chunks: list[int] = []
-        self._attachments: list[int] = []
+        self._attachments: list[tuple[int, int]] = []
         topics: dict[int, str] = {}
         try:
             reader = StreamReader(io.BytesIO(summary + tail), skip_magic=True)
@@ -246,7 +250,7 @@ class Recording:
                 elif isinstance(record, ChunkIndex):
                     self._chunks.append(record.chunk_start_offset)
                 elif isinstance(record, AttachmentIndex):
-                    self._attachments.append(record.offset)
+                    self._attachments.append((record.offset, record.length))
                 elif isinstance(record, MetadataIndex):
                     place = _record_at(stream, record.offset, Metadata)
                     self.metadata[place.name] = place.metadata
@@ -300,10 +304,12 @@ class Recording:
     def attachments(self) -> Iterator[Attachment]:
         """Iterate over the attachments: the log of each operator."""
         with self.path.open("rb") as stream:
-            for place in self._attachments:
+            for place, length in self._attachments:
                 try:
                     record = _record_at(stream, place, Attachment)
-                    if zlib.crc32(bytes_of(record)[9:-4]) != struct.unpack("<I", stream.read(4))[0]:
+                    stream.seek(place + 9)
+                    content = stream.read(length - 9)
+                    if zlib.crc32(content[:-4]) != int.from_bytes(content[-4:], "little"):
                         raise ValueError(f"the checksum of {record.name} does not fit")
                 except Exception as error:
                     raise _complaint(self.path, error) from error
