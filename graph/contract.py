@@ -43,6 +43,10 @@ class Operator:
     def __init__(self, config: Any = None) -> None:
         self.config = type(self).Config() if config is None else config
 
+    @classmethod
+    def warm_up(cls) -> None:
+        """Run on made-up data what has to be compiled; called in a live process before the run begins."""
+
     def on_start(self) -> Any:
         return None
 

@@ -15,9 +15,10 @@ import msgspec
 import numpy as np
 
 from graph.contract import Operator, Summary
-from graph.geometry import Matrix, inverse
+from graph.geometry import Matrix, inverse, planar
 from graph.messages import MapCloud, OccupancyGrid, Odometry, PointCloud, Pose
 from operators.pointmap import Criteria, Mapper, Settings, Track, Trail, load_map
+from operators.pointmap.rehearsal import room_scan
 
 SECOND = 1_000_000_000  # nanoseconds
 
@@ -66,6 +67,18 @@ class Localizer(Operator):
         self.world_from_odom: Matrix = np.eye(4)
         self.map_due, self.occupancy_due = 0, 0
         self.frames, self.invalid, self.iterations = 0, 0, 0
+
+    @classmethod
+    def warm_up(cls) -> None:
+        """Localize two scans of a made-up room."""
+        rehearsed = cls()
+        for index, turn in enumerate((0.0, 0.02)):
+            stamp = index * SECOND // 10
+            pose = planar(0.0, 0.0, turn)
+            at = Odometry(measured_at=stamp, odom_from_base=pose, linear=0.0, angular=0.0, true_world_from_base=pose)
+            mount = planar(0.0, 0.0, 0.0, 0.64)
+            rehearsed.on_odometry(at)
+            rehearsed.on_frame(PointCloud(measured_at=stamp, points=room_scan(turn=turn), base_from_lidar=mount))
 
     def on_odometry(self, odometry: Odometry) -> None:
         """Remember where wheels and gyro say the robot is."""

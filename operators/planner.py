@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections import deque
 
 import msgspec
+import numpy as np
 
 from graph.contract import Operator
-from graph.geometry import Matrix, interpolate
+from graph.geometry import Matrix, interpolate, planar
 from graph.messages import Drive, Goal, OccupancyGrid, Plan, PointCloud, Pose
 from operators.navigation.footprint import Footprint
 from operators.navigation.navigator import Navigator
 from operators.navigation.window import Limits
+from operators.pointmap.rehearsal import room_scan
 
 HISTORY = 50  # poses kept, to find where a frame was taken
 WAITING = 10  # frames kept until the pose of their time is known
@@ -56,6 +58,18 @@ class Planner(Operator):
         )
         self._poses: deque[tuple[int, Matrix]] = deque(maxlen=HISTORY)
         self._frames: deque[PointCloud] = deque(maxlen=WAITING)
+
+    @classmethod
+    def warm_up(cls) -> None:
+        """Plan twice in a made-up room."""
+        rehearsed = cls()
+        mount = planar(0.0, 0.0, 0.0, 0.64)
+        cells = np.zeros((160, 160), np.int8)
+        rehearsed.on_goal(Goal(measured_at=0, target=np.array([2.0, 1.0]), index=0, count=1))
+        rehearsed.on_map(OccupancyGrid(measured_at=0, cells=cells, origin=np.array([-4.0, -4.0]), resolution=0.05))
+        for stamp in (0, 100_000_000):
+            rehearsed.on_obstacles(PointCloud(measured_at=stamp, points=room_scan(), base_from_lidar=mount))
+            rehearsed.on_pose(Pose(measured_at=stamp, world_from_base=np.eye(4)))
 
     def on_goal(self, goal: Goal) -> None:
         self.navigator.set_goal(float(goal.target[0]), float(goal.target[1]))

@@ -21,6 +21,7 @@ from graph.contract import End, Operator, Summary
 from graph.geometry import Matrix
 from graph.messages import Drive, Goal, Odometry, PointCloud, Pose, Tick, Truth
 from sim.referee import Referee
+from sim.rehearsal import rehearse
 from sim.world import World
 
 SECOND = 1_000_000_000  # nanoseconds
@@ -59,6 +60,10 @@ class Simulator(Operator):
         self.command = (0.0, 0.0)
         self.now: int | None = None  # stamp of the last tick
         self.poses: dict[int, Matrix] = {}  # true world_from_base by stamp, for estimates still to come
+
+    @classmethod
+    def warm_up(cls) -> None:
+        rehearse()
 
     def on_drive(self, drive: Drive) -> None:
         """Obey from the next tick on."""
