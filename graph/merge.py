@@ -155,6 +155,7 @@ def merge(
             if text := log.read_bytes():
                 writer.add_attachment(0, 0, f"log/{log.stem}.txt", "text/plain", text)
         verdict = Verdict("INCOMPLETE" if why else "COMPLETE", why, end, wall_seconds, accounts, count)
+        writer.add_metadata(RUN, seal(run))  # again: a recording without it is lost, whatever else is whole
         writer.add_metadata(VERDICT, seal(verdict))
         writer.finish()  # type: ignore[no-untyped-call]
     part.replace(out)

@@ -77,7 +77,7 @@ class _Scan:
     """Walks over the records of damaged MCAP bytes; what is not whole is noted and left out."""
 
     def __init__(self, data: mmap.mmap) -> None:
-        self.data = memoryview(data)
+        self.file, self.data = data, memoryview(data)
         self.run: Run | None = None
         self.chunks = 0
         self.lost: list[str] = []
@@ -86,22 +86,37 @@ class _Scan:
         self.ids: dict[tuple[str, int, str], int] = {}
 
     def records(self) -> Iterator[tuple[int, int, memoryview]]:
-        """Iterate over (place, opcode, content) as far as lengths make sense."""
+        """Iterate over (place, opcode, content); where a record makes no sense, go on at the next chunk that does."""
         place = len(MAGIC)
+        chunk = self._chunk_from(place)
         while place + 9 <= len(self.data):
-            opcode = self.data[place]
-            length = int.from_bytes(self.data[place + 1 : place + 9], "little")
-            if not 1 <= opcode <= 0x0F:
-                self.lost.append(f"{len(self.data) - place} bytes from byte {place} on make no record")
-                return
-            if place + 9 + length > len(self.data):
-                self.lost.append(f"the record at byte {place} is cut short")
-                return
-            yield place, opcode, self.data[place + 9 : place + 9 + length]
+            opcode, end = self.data[place], place + 9 + self._number(place + 1)
+            if chunk < place:
+                chunk = self._chunk_from(place)
+            sound = place == chunk if opcode == Opcode.CHUNK else 1 <= opcode <= Opcode.DATA_END and end <= chunk
+            if not sound:
+                self.lost.append(f"{chunk - place} bytes from byte {place} on make no record")
+                place = chunk
+                continue
+            yield place, opcode, self.data[place + 9 : end]
             if opcode == Opcode.FOOTER:
                 return
-            place += 9 + length
+            place = end
         self.lost.append("the file ends without an index")
+
+    def _chunk_from(self, place: int) -> int:
+        """Return where the next chunk begins whose lengths fit each other; the end of the file if there is none."""
+        head = 1 + 8 + 28  # opcode, length, two stamps, size, checksum; then the compression by name, and a length
+        while (name := self.file.find(b"\x04\x00\x00\x00zstd", place + head)) >= 0:
+            start, rest = name - head, self._number(name + 8)
+            fits = self._number(start + 1) == 28 + 8 + 8 + rest and name + 16 + rest <= len(self.data)
+            if self.data[start] == Opcode.CHUNK and fits:
+                return start
+            place = start + 1
+        return len(self.data)
+
+    def _number(self, place: int) -> int:
+        return int.from_bytes(self.data[place : place + 8], "little")
 
     def _read_index(self) -> None:
         """Take schemas and channels from the index at the end, if it is left: a lost chunk may have held them."""
