@@ -25,7 +25,7 @@ from sim.layout import RESOLUTION, Seat, draw
 from sim.lidar import NOTHING, PRESETS, Hits, Lidar, LidarSpec, People
 from sim.odometry import Odometer, OdometryNoise
 from sim.physics import GLIDE, SUBSTEP, Physics
-from sim.scenario import load_scenario
+from sim.scenario import Scenario, load_scenario
 from sim.solids import Body, Box, Prism, Truth, triangles_of
 from sim.sweep import along
 
@@ -73,7 +73,7 @@ class World:
     def __init__(
         self,
         building: Path | str | Building,
-        scenario: Path | str,
+        scenario: Path | str | Scenario,
         tour: str,
         seed: int,
         *,
@@ -83,7 +83,7 @@ class World:
         odometry: OdometryNoise | None = None,
     ) -> None:
         self.building: Building = building if isinstance(building, Building) else load(building)
-        self.scenario = load_scenario(scenario)
+        self.scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
         if isinstance(lidar, str):
             if lidar not in PRESETS:
                 raise BuildingError(f"there is no lidar {lidar!r}; there are {', '.join(PRESETS)}")
@@ -99,7 +99,6 @@ class World:
         self.lidar = Lidar(self.spec, triangles, owner)
         self.physics = Physics(self.layout.bodies, self.start)
         self.noise = np.random.default_rng([seed, 3])
-        self.odometer = Odometer(self.start, odometry or OdometryNoise(), np.random.default_rng([seed, 4]))
         shadows = [_shadow(seat) for seat in self.layout.seats]
         self.free = clearance(self.layout.bodies + shadows, self.building.bounds(), RESOLUTION)
         self._rooms()
@@ -109,7 +108,8 @@ class World:
         self.touched: dict[int, float] = {}  # instance: when it was last touched
         self.collisions = {"people": 0, "things": 0}
         self.motion = self.physics.motion()
-        self.odometer.advance(self.motion, 0.0, 1.0)
+        rng = np.random.default_rng([seed, 4])
+        self.odometer = Odometer(self.motion, odometry or OdometryNoise(), rng)
         self.capsules = self._capsules()
         self.bodies_before = self.capsules
         self.trail = [self.motion.world_from_base] * 2  # evenly over the last advance
