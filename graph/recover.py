@@ -59,9 +59,9 @@ def _recover_file(source: Path, out: Path) -> Recovery:
         raise RecordingError(f"{source} is empty: there is nothing to recover")
     with source.open("rb") as stream:
         data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-    if data[: len(MAGIC)] != MAGIC:
-        raise RecordingError(f"{source} is not an MCAP file: it does not begin as one does")
     scan = _Scan(data)
+    if data[: len(MAGIC)] != MAGIC and scan.chunk_from(0) == len(data):
+        raise RecordingError(f"{source} is not an MCAP file: it does not begin as one does, and holds no chunk")
     with tempfile.TemporaryDirectory(dir=out.parent) as folder:
         shards = scan.split(Path(folder))
         if scan.run is None:
@@ -88,11 +88,11 @@ class _Scan:
     def records(self) -> Iterator[tuple[int, int, memoryview]]:
         """Iterate over (place, opcode, content); where a record makes no sense, go on at the next chunk that does."""
         place = len(MAGIC)
-        chunk = self._chunk_from(place)
+        chunk = self.chunk_from(place)
         while place + 9 <= len(self.data):
             opcode, end = self.data[place], place + 9 + self._number(place + 1)
             if chunk < place:
-                chunk = self._chunk_from(place)
+                chunk = self.chunk_from(place)
             sound = place == chunk if opcode == Opcode.CHUNK else 1 <= opcode <= Opcode.DATA_END and end <= chunk
             if not sound:
                 self.lost.append(f"{chunk - place} bytes from byte {place} on make no record")
@@ -104,7 +104,7 @@ class _Scan:
             place = end
         self.lost.append("the file ends without an index")
 
-    def _chunk_from(self, place: int) -> int:
+    def chunk_from(self, place: int) -> int:
         """Return where the next chunk begins whose lengths fit each other; the end of the file if there is none."""
         head = 1 + 8 + 28  # opcode, length, two stamps, size, checksum; then the compression by name, and a length
         while (name := self.file.find(b"\x04\x00\x00\x00zstd", place + head)) >= 0:
