@@ -29,10 +29,26 @@ class ShardReader:
         self.path = path
         self.damage = ""  # what is wrong with the end of the file
         self.ended = False  # on_end has run
+        self.cut = INFINITY  # index of the first call that is left out
+        self.left_out = 0
         self.channels = Channels()
 
     def entries(self) -> Iterator[Entry]:
         """Iterate over what the operator wrote: the messages of a call, then its step. Stops at the first damage."""
+        if self.cut == INFINITY:
+            yield from self._written()
+            return
+        call: list[Entry] = []
+        for entry in self._written():
+            call.append(entry)
+            if entry.port == STEP:
+                if entry.step().index < self.cut:
+                    yield from call
+                else:
+                    self.left_out += 1
+                call.clear()
+
+    def _written(self) -> Iterator[Entry]:
         try:
             with self.path.open("rb") as stream:
                 for record in read_records(stream):
@@ -47,6 +63,42 @@ class ShardReader:
             self.damage = str(error) or type(error).__name__
 
 
+def leave_out(readers: Sequence[ShardReader]) -> list[str]:
+    """Cut from shards of lockstep the last calls whose messages were never written; return sentences that say so.
+
+    An operator puts its messages before it writes them. One that is killed in between leaves the others with calls that no
+    replay could repeat.
+    """
+    steps: dict[ShardReader, list[Step]] = {reader: [] for reader in readers}
+    there: set[tuple[str, int]] = set()  # topic, sequence
+    for reader in readers:
+        for entry in reader.entries():
+            if entry.port == STEP:
+                steps[reader].append(entry.step())
+                there.update((f"{entry.operator}/{item.port}", item.sequence) for item in steps[reader][-1].emitted)
+            elif entry.port != SUMMARY:
+                there.add((entry.topic, entry.sequence))
+    again = True
+    while again:
+        again = False
+        for reader, own in steps.items():
+            for place, step in enumerate(own):
+                if all(ref.topic.startswith("timer/") or (ref.topic, ref.sequence) in there for ref in step.consumed):
+                    continue
+                reader.cut = step.index
+                name = reader.path.name.partition(".")[0]
+                there -= {(f"{name}/{item.port}", item.sequence) for late in own[place:] for item in late.emitted}
+                del own[place:]
+                again = True
+                break
+    return [
+        f"calls of {reader.path.name.partition('.')[0]} from number {reader.cut} on are left out: what they consumed"
+        " was never written"
+        for reader in readers
+        if reader.cut < INFINITY
+    ]
+
+
 class Ledger:
     """What the steps say, summed up edge by edge."""
 
@@ -57,12 +109,12 @@ class Ledger:
         self.skipped: Counter[tuple[str, str]] = Counter()
         self.unhandled: Counter[str] = Counter()
         self.emissions: dict[str, list[int]] = {}  # topic: stamps
-        self.digests: dict[tuple[str, int, int], bytes] = {}  # of messages whose step is still to come
+        self.digests: dict[tuple[str, int, int], tuple[bytes, int]] = {}  # and stamps, while their step is to come
         self.mismatches: list[str] = []
 
     def message(self, entry: Entry) -> None:
         """Remember a message's digest until its step says what it should be."""
-        self.digests[(entry.topic, entry.incarnation, entry.sequence)] = digest(entry.payload)
+        self.digests[(entry.topic, entry.incarnation, entry.sequence)] = digest(entry.payload), entry.stamp
 
     def step(self, operator: str, incarnation: int, step: Step) -> None:
         """Count one call."""
@@ -70,7 +122,7 @@ class Ledger:
             topic = f"{operator}/{item.port}"
             self.emissions.setdefault(topic, []).append(step.stamp)
             written = self.digests.pop((topic, incarnation, item.sequence), None)
-            if written is not None and written != item.digest:
+            if written is not None and written[0] != item.digest:
                 self.mismatches.append(f"{topic} number {item.sequence} is not what its step says")
             elif written is None and self.specs[operator].record.get(item.port) == "full":
                 self.mismatches.append(f"{topic} number {item.sequence} is missing")
@@ -83,6 +135,9 @@ class Ledger:
 
     def accounts(self, end: int) -> list[EdgeAccount]:
         """Balance every edge; `end` is the stamp after which nothing was handled."""
+        for (topic, _, _), (_, stamp) in self.digests.items():  # of a call that failed after it had spoken
+            self.emissions.setdefault(topic, []).append(stamp)
+        self.digests.clear()
         accounts = []
         for consumer in self.specs.values():
             edges = [edge for edge in consumer.inputs if edge.period is None]
@@ -114,6 +169,8 @@ def merge(
     """
     by_name = {spec.name: spec for spec in run.specs}
     readers = [ShardReader(path) for path in shards]
+    if reasons and all(spec.mode == "lockstep" for spec in run.specs):
+        reasons = [*reasons, *leave_out(readers)]
     part = out.with_name(out.name + ".part")
     ledger = Ledger(by_name)
     ended: set[str] = set()
@@ -175,7 +232,12 @@ def _shortcomings(
     why += [
         f"{account.lost} of {account.emitted} messages were lost from {account.topic} to {account.operator}"
         for account in accounts
-        if account.lost and specs[account.operator].kind != "sink"
+        if account.lost > 0 and specs[account.operator].kind != "sink"
+    ]
+    why += [
+        f"{-account.lost} messages that {account.operator} had from {account.topic} were never written"
+        for account in accounts
+        if account.lost < 0
     ]
     why += [
         f"{number} messages were left unhandled by {name}"
