@@ -327,6 +327,7 @@ class Launcher:
             self.paths.recording,
             self.run,
             reasons=self.reasons,
+            crashed=bool(self.reasons),
             wall_seconds=wall,
             logs=[log for log in logs if log.exists()],
         )

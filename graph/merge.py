@@ -66,8 +66,8 @@ class ShardReader:
 def leave_out(readers: Sequence[ShardReader]) -> list[str]:
     """Cut from shards of lockstep the last calls whose messages were never written; return sentences that say so.
 
-    An operator puts its messages before it writes them. One that is killed in between leaves the others with calls that no
-    replay could repeat.
+    An operator puts its messages before it writes them. One that is killed in between leaves the others with calls
+    that no replay could repeat.
     """
     steps: dict[ShardReader, list[Step]] = {reader: [] for reader in readers}
     there: set[tuple[str, int]] = set()  # topic, sequence
@@ -160,16 +160,18 @@ def merge(
     run: Run,
     *,
     reasons: Sequence[str] = (),
+    crashed: bool = False,
     wall_seconds: float = 0.0,
     logs: Sequence[Path] = (),
 ) -> Verdict:
     """Merge shards into a recording; the file appears under its name only when it is whole.
 
-    reasons: why the run is incomplete, as far as the launcher knows. Returns the verdict that the file carries.
+    reasons: why the run is incomplete, as far as the launcher knows. crashed: some operators may have been killed
+    between putting messages and writing them. Returns the verdict that the file carries.
     """
     by_name = {spec.name: spec for spec in run.specs}
     readers = [ShardReader(path) for path in shards]
-    if reasons and all(spec.mode == "lockstep" for spec in run.specs):
+    if crashed and all(spec.mode == "lockstep" for spec in run.specs):
         reasons = [*reasons, *leave_out(readers)]
     part = out.with_name(out.name + ".part")
     ledger = Ledger(by_name)

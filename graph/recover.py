@@ -47,6 +47,7 @@ def recover(source: Path, out: Path) -> Recovery:
             out,
             run_of(source),
             reasons=["the launcher was killed; the shards were merged by recover"],
+            crashed=True,
             logs=sorted(source.glob("*.log")),
         )
         return Recovery(verdict, verdict.messages, 0, verdict.reasons[1:])
