@@ -45,7 +45,7 @@ class Operator:
 
     @classmethod
     def warm_up(cls) -> None:
-        """Run on made-up data what has to be compiled; called in a live process before the run begins."""
+        """Run on made-up data what has to be compiled; called before the operator is constructed."""
 
     def on_start(self) -> Any:
         return None

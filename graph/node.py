@@ -37,8 +37,9 @@ Emit = Callable[[Emission], None]
 
 
 def build_operator(spec: NodeSpec) -> Operator:
-    """Import and construct the operator of a spec. Raises UserError by name."""
+    """Import, warm up and construct the operator of a spec. Raises UserError by name."""
     kind = load_class(spec.run, spec.root)
+    kind.warm_up()
     return kind(build_config(kind, spec.config, Path(spec.root)))
 
 

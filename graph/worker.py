@@ -70,9 +70,7 @@ class Worker:
     def __init__(self, boot: Boot, wire: Wire) -> None:
         self.boot, self.wire, self.spec = boot, wire, boot.spec
         set_threads(self.spec.threads)
-        operator = build_operator(self.spec)
-        operator.warm_up()
-        self.node = Node(self.spec, operator, boot.incarnation)
+        self.node = Node(self.spec, build_operator(self.spec), boot.incarnation)
         set_threads(self.spec.threads)
         self.shard = Shard(Path(boot.shard), self.spec, schemas_of(self.node.output_types), boot.incarnation)
         self.lockstep = Lockstep(self.spec) if self.spec.mode == "lockstep" and self.spec.kind != "sink" else None
