@@ -261,8 +261,9 @@ class Launcher:
         self.status.phase = "stopping"
         if self.realtime:
             self.tell(Control("stop"))
-            self._await(self._at_rest, deadline, before)
-            self.tell(Control("finish"))
+            while not self._at_rest() and time.monotonic() < deadline and self.interrupts == before:
+                self.listen(POLL)
+            self.tell(Control("finish"))  # what is left now, the operators note as unhandled
         else:
             self.tell(Control("pause"))
             self._await(

@@ -72,14 +72,14 @@ class Node:
         stamp, self.peeked = int(item[0]), item[1]
         if stamp <= self.last_stamp:
             raise OutputError(
-                f"{self.spec.name}: stamps of a stream increase strictly from 0; {stamp} ns follows {self.last_stamp} ns"
+                f"{self.spec.name}: stamps of a stream increase strictly from 0; {stamp} ns comes after {self.last_stamp}"
             )
         self.last_stamp = stamp
         return stamp
 
-    def start(self, emit: Emit) -> Step:
-        """Run on_start, at stamp 0."""
-        return self._run(START, 0, self.operator.on_start, (), emit)
+    def start(self, emit: Emit, stamp: int = 0) -> Step:
+        """Run on_start, at stamp 0 or when an operator is brought back."""
+        return self._run(START, stamp, self.operator.on_start, (), emit)
 
     def finish(self, stamp: int, emit: Emit, skipped: tuple[Skip, ...] = ()) -> Step:
         """Run on_end, at the stamp at which the run ends; `skipped` names what nobody will handle."""

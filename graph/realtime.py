@@ -42,6 +42,11 @@ class Realtime:
         """Queue the next item of a source's stream; INFINITY says that there are no more."""
         self.stream = None if stamp >= INFINITY else stamp
 
+    def resume(self, now: int) -> None:
+        """Begin in the midst of a run: the ticks so far were for an incarnation before this one."""
+        self.handled = now
+        self.ticks = [0 if edge.period is None else now // edge.period + 1 for edge in self.spec.inputs]
+
     def next(self, now: int) -> Arrival | None:
         """Return what to handle now, and forget it; None if nothing has arrived or is due."""
         best: Arrival | None = None
@@ -85,7 +90,7 @@ class Realtime:
         until = now if self.spec.duration is None else min(now, self.spec.duration)
         for port, edge in enumerate(self.spec.inputs):
             if edge.period is not None and (number := until // edge.period) >= self.ticks[port]:
-                due.append(Arrival(number * edge.period, port, number, 0, None))
+                due.append(Arrival(number * edge.period + edge.delay, port, number, 0, None))
         return due
 
     def wake(self) -> int:

@@ -248,7 +248,7 @@ class _Run:
 
     def _call(self, node: Node, step: Step, emit: Callable[[Emission], None]) -> Step:
         if step.port == START:
-            return node.start(emit)
+            return node.start(emit, step.stamp)
         if step.port == END:
             return node.finish(step.stamp, emit, step.skipped)
         (ref,) = step.consumed

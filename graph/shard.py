@@ -71,12 +71,17 @@ class Shard:
         self, emissions: Iterable[Emission], step: Step, summary: Summary | dict[str, object] | None = None
     ) -> None:
         """Append the messages of one call, then its step; flushed when this returns."""
-        for emission in emissions:
-            if self.spec.record[emission.port] == "full":
-                self._add(emission.port, emission.stamp, emission.sequence, emission.payload)
+        self.leave(emissions)
         if summary is not None:
             self._add(SUMMARY, step.stamp, 0, msgspec.msgpack.encode(summary))
         self._add(STEP, step.stamp, step.index, msgspec.msgpack.encode(step))
+        self.stream.flush()
+
+    def leave(self, emissions: Iterable[Emission]) -> None:
+        """Append messages alone: those of a call that failed after it had spoken."""
+        for emission in emissions:
+            if self.spec.record[emission.port] == "full":
+                self._add(emission.port, emission.stamp, emission.sequence, emission.payload)
         self.stream.flush()
 
     def _add(self, port: str, stamp: int, sequence: int, data: bytes) -> None:

@@ -155,6 +155,8 @@ class Worker:
             self.lockstep.consumer_at(rest, sample.envelope[2])
         elif kind == "stream":
             (self.lockstep or self.realtime).offer(sample.envelope[2])  # type: ignore[union-attr]
+            if self.realtime and sample.envelope[2] == INFINITY and self.spec.end == self.spec.name:
+                self.own_end = self.realtime.handled
         elif kind == "failed":
             raise SystemExit(1)
         elif kind == "control":
@@ -257,7 +259,11 @@ class Worker:
                 self.run_lockstep(self.lockstep)
             else:
                 assert self.realtime is not None
-                self.run_realtime(self.realtime)
+                try:
+                    self.run_realtime(self.realtime)
+                except BaseException:
+                    self.shard.leave(self.emissions)  # the others may have had them
+                    raise
         self.phase = "finished"
         self.report(force=True)
         while not self.leaving:
@@ -317,7 +323,9 @@ class Worker:
         """Handle what has arrived, the earliest first, until told to finish."""
         node, origin = self.node, self.origin
         assert origin is not None
-        self.after(node.start(self.emit))
+        if self.boot.incarnation:
+            schedule.resume(time.monotonic_ns() - origin)
+        self.after(node.start(self.emit, schedule.handled))
         if self.spec.kind == "source":
             self.demand.release()
         while not (self.leaving or self.closing):
