@@ -21,7 +21,7 @@ class Skip(msgspec.Struct, frozen=True, array_like=True):
     topic: str
     incarnation: int
     sequence: int
-    why: str  # queue: a newer one displaced it; missed: a tick that came while busy
+    why: str  # queue: newer ones displaced it; missed: a tick while busy; unhandled: no time was left; end: too late
 
 
 class Emitted(msgspec.Struct, frozen=True, array_like=True):

@@ -72,7 +72,7 @@ class Node:
         stamp, self.peeked = int(item[0]), item[1]
         if stamp <= self.last_stamp:
             raise OutputError(
-                f"{self.spec.name}: stamps of a stream increase strictly from 0; {stamp} ns comes after {self.last_stamp}"
+                f"{self.spec.name}: stamps of a stream increase strictly from 0; {stamp} comes after {self.last_stamp}"
             )
         self.last_stamp = stamp
         return stamp

@@ -109,9 +109,9 @@ class Realtime:
         skips, self.skips = tuple(self.skips), []
         return skips
 
-    def leave(self) -> tuple[Skip, ...]:
+    def leave(self, why: str = "unhandled") -> tuple[Skip, ...]:
         """Give up what still waits: nobody will handle it."""
         for edge, waiting in zip(self.spec.inputs, self.queues, strict=True):
-            self.skips += [Skip(edge.topic, old.incarnation, old.sequence, "unhandled") for old in waiting]
+            self.skips += [Skip(edge.topic, old.incarnation, old.sequence, why) for old in waiting]
             waiting.clear()
         return self.take_skips()

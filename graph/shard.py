@@ -71,7 +71,7 @@ class Shard:
         self, emissions: Iterable[Emission], step: Step, summary: Summary | dict[str, object] | None = None
     ) -> None:
         """Append the messages of one call, then its step; flushed when this returns."""
-        self.leave(emissions)
+        self._messages(emissions)
         if summary is not None:
             self._add(SUMMARY, step.stamp, 0, msgspec.msgpack.encode(summary))
         self._add(STEP, step.stamp, step.index, msgspec.msgpack.encode(step))
@@ -79,10 +79,13 @@ class Shard:
 
     def leave(self, emissions: Iterable[Emission]) -> None:
         """Append messages alone: those of a call that failed after it had spoken."""
+        self._messages(emissions)
+        self.stream.flush()
+
+    def _messages(self, emissions: Iterable[Emission]) -> None:
         for emission in emissions:
             if self.spec.record[emission.port] == "full":
                 self._add(emission.port, emission.stamp, emission.sequence, emission.payload)
-        self.stream.flush()
 
     def _add(self, port: str, stamp: int, sequence: int, data: bytes) -> None:
         # what Writer.add_message writes, without its two copies of the data

@@ -351,7 +351,13 @@ class Worker:
         if self.spec.kind == "sink":
             while (arrival := schedule.next(time.monotonic_ns() - origin)) is not None:
                 self.after(node.handle(arrival, arrival.time, self.emit))
-        self.after(node.finish(schedule.handled, self.emit, schedule.leave()))
+        last = node.finish(schedule.handled, self.emit, schedule.leave())
+        self.phase = "finished"
+        self.report(force=True)
+        while not self.leaving:
+            self.drain(1.0)
+        late = schedule.leave("end")  # what others said in their on_end
+        self.after(msgspec.structs.replace(last, skipped=last.skipped + late))
 
 
 def _outlive_nobody() -> None:
