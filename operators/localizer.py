@@ -36,6 +36,7 @@ class Localizer(Operator):
         samples: int = 600  # points drawn at each iteration of the alignment
         largest_jump: float = 0.5  # metres between odometry and alignment; beyond, the pose is not valid
         largest_turn: float = math.radians(15.0)
+        upright: float = 0.2  # share of height and tilt given up at each frame, where odometry knows of none
         grow: bool = True  # whether aligned frames enter the map
         cell: float = 0.05  # metres, of the occupancy grid
         map_period: float = 1.0  # seconds between two messages of new map points
@@ -59,6 +60,7 @@ class Localizer(Operator):
             criteria=Criteria(samples=c.samples),
             largest_jump=c.largest_jump,
             largest_turn=c.largest_turn,
+            upright=c.upright,
             grow=c.grow,
             seed=c.seed,
         )
@@ -115,7 +117,7 @@ class Localizer(Operator):
     def locate(self, frame: PointCloud, world_from_base: Matrix) -> Track:
         """Align a frame, starting from a guess of where the base was."""
         points = self.trail.steady(frame.points, frame.time_offset, frame.base_from_lidar)
-        return self.mapper.look(points, world_from_base, frame.base_from_lidar)
+        return self.mapper.look(points, world_from_base, frame.base_from_lidar, level=self.trail.level())
 
     def new_points(self, stamp: int) -> MapCloud | None:
         """Return the points added since the last message, when it is time; the first message has all."""

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from test_pointmap_room import BASE_FROM_LIDAR, BOXES, scan
 
-from graph.geometry import exponential, inverse, planar, rotation_angle, transform
+from graph.geometry import exponential, inverse, planar, rotation_angle, transform, yaw
 from operators.pointmap import Criteria, PointMap, Settings
 from operators.pointmap.draw import alias_table, generator, sample, uniform
 from operators.pointmap.icp import mean_pose, solve, turned
+from operators.pointmap.slam import leveled
 
 
 def error_of(world_from_lidar, truth):
@@ -217,3 +218,15 @@ def test_a_map_that_shall_not_grow_does_not():
     assert before > 1000
     assert pointmap.track(scan(pose @ planar(0.3, 0.0, 0.0)), pose).valid
     assert len(pointmap.map) == before
+
+
+def test_a_level_robot_gives_up_height_and_tilt_but_no_place():
+    pose = planar(1.0, -2.0, 0.7, 0.03)
+    pose[:3, :3] = pose[:3, :3] @ exponential([0.01, 0.02, 0.0])
+    pose[:3, :3] = exponential([0.0, 0.0, 0.7 - yaw(pose)]) @ pose[:3, :3]
+    half = leveled(pose, 0.5)
+    assert np.allclose(half[:2, 3], pose[:2, 3])
+    assert half[2, 3] == pytest.approx(0.015)
+    assert math.acos(half[2, 2]) == pytest.approx(0.5 * math.acos(pose[2, 2]), rel=1e-3)
+    assert np.allclose(leveled(pose, 1.0), planar(1.0, -2.0, yaw(pose)))
+    assert np.allclose(leveled(pose, 0.0), pose)

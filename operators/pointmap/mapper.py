@@ -29,17 +29,27 @@ class Mapper:
             self.occupancy.add_map(initial.points, height_above(level, initial.points))
 
     def look(
-        self, points: npt.NDArray[Any], world_from_base: Matrix, base_from_lidar: Matrix, *, known: bool = False
+        self,
+        points: npt.NDArray[Any],
+        world_from_base: Matrix,
+        base_from_lidar: Matrix,
+        *,
+        level: bool = False,
+        known: bool = False,
     ) -> Track:
         """Align a frame (n, 3) in the sensor's frame and enter it, unless it is refused.
 
-        world_from_base: (4, 4) the guess; the pose itself if it is `known`. The grid takes its heights from the ground
-        of the frame, or from the floor under the base where the frame shows none.
+        world_from_base: (4, 4) the guess; the pose itself if it is `known`. level: the robot drives on one level floor
+        at height 0. Every other frame enters the grid, which takes heights from the ground of the frame, or from the
+        floor under the base where the frame shows none.
         """
         frame = self.pointmap.prepare(points)
         guess = world_from_base @ base_from_lidar
-        track = self.pointmap.enter(frame, guess) if known else self.pointmap.track_frame(frame, guess)
-        if track.valid and len(frame.points):
+        if known:
+            track = self.pointmap.enter(frame, guess)
+        else:
+            track = self.pointmap.track_frame(frame, guess, base_from_lidar if level else None)
+        if track.valid and len(frame.points) and self.pointmap.frames % 2 == 1:
             world, normals = frame.moved(track.world_from_lidar)
             ground = find_ground(world, normals)
             floor = (track.world_from_lidar @ inverse(base_from_lidar))[2, 3]

@@ -11,10 +11,10 @@ from numba import njit
 from operators.pointmap.store import (
     BLOCK_BITS,
     BLOCK_VOXELS,
+    CELL_BITS,
     CELL_BLOCKS,
-    HEAD,
     KEY,
-    LINK,
+    LAYER,
     MASK,
     NONE,
     SIZE,
@@ -125,19 +125,32 @@ def search_cell(
     store: Store, cell: int, edge: float, x: float, y: float, z: float, place: int, square: float
 ) -> tuple[int, float]:
     """Return place and squared distance of the nearest so far, after the blocks (of `edge` metres) of a cell's slot."""
-    block = store.cells[cell, HEAD]
-    while block != NONE:
-        key = store.blocks[block, KEY]
-        i, j, k = unpack(key)
-        dx, dy, dz = gap(i, edge, x), gap(j, edge, y), gap(k, edge, z)
-        if dx * dx + dy * dy + dz * dz < square:
-            slot = find(store.table, key)
-            for candidate in range(store.table[slot, START], store.table[slot, START] + store.table[slot, SIZE]):
-                dx, dy, dz = store.pool[candidate, 0] - x, store.pool[candidate, 1] - y, store.pool[candidate, 2] - z
-                d2 = dx * dx + dy * dy + dz * dz
-                if d2 < square:
-                    place, square = candidate, d2
-        block = store.blocks[block, LINK]
+    i, j, k = unpack(store.cells[cell, KEY])
+    i, j, k = i << CELL_BITS, j << CELL_BITS, k << CELL_BITS
+    for c in range(CELL_BLOCKS):
+        layer = store.cells[cell, LAYER + c]
+        dz = gap(k + c, edge, z)
+        if layer == 0 or dz * dz >= square:
+            continue
+        for b in range(CELL_BLOCKS):
+            row = (layer >> (CELL_BLOCKS * b)) & 255
+            dy = gap(j + b, edge, y)
+            if row == 0 or dy * dy + dz * dz >= square:
+                continue
+            for a in range(CELL_BLOCKS):
+                dx = gap(i + a, edge, x)
+                if (row >> a) & 1 == 0 or dx * dx + dy * dy + dz * dz >= square:
+                    continue
+                slot = find(store.table, pack(i + a, j + b, k + c))
+                for candidate in range(store.table[slot, START], store.table[slot, START] + store.table[slot, SIZE]):
+                    ex, ey, ez = (
+                        store.pool[candidate, 0] - x,
+                        store.pool[candidate, 1] - y,
+                        store.pool[candidate, 2] - z,
+                    )
+                    d2 = ex * ex + ey * ey + ez * ez
+                    if d2 < square:
+                        place, square = candidate, d2
     return place, square
 
 

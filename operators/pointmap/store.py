@@ -1,9 +1,9 @@
 """The memory of a voxel map: voxels in blocks of 4 x 4 x 4, blocks in cells of 8 x 8 x 8.
 
 One look-up in a hash table finds a block and with it 64 voxels: a mask of 64 bits says which are taken, and the points
-of a block lie side by side in a pool, in the order of their voxels, so that the mask also says where. A cell chains its
-blocks, so that a search steps over a cubic metre of emptiness at once. A search waits for memory and hardly ever
-computes: so what is read together lies together, in rows.
+of a block lie side by side in a pool, in the order of their voxels, so that the mask also says where. A cell has a
+bit for each of its blocks, so that a search steps over a cubic metre of emptiness at once. A search waits for memory
+and hardly ever computes: so what is read together lies together, in rows.
 """
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ LEAST_ROOM = 8  # points for which a new block has room in the pool
 FARTHEST = 1 << 20  # voxel coordinates that fit the packed keys
 
 KEY, START, SIZE, MASK = 0, 1, 2, 3  # columns of the table of blocks: START, SIZE of the points in the pool
-HEAD = 1  # column of the table of cells: its first block
-LINK = 1  # column of the blocks: the next block of the same cell
+LAYER = 1  # first of 8 columns of the table of cells: the taken blocks of one layer, 8 x 8 bits
 NORMAL, SCORE = 3, 6  # first columns of `rows` after the coordinates
 
 
@@ -41,8 +40,7 @@ class Store(NamedTuple):
     pool: Floats  # (places, 4) x y z once more, block by block, voxel by voxel
     pool_number: Ints  # (places, 4) the same memory as `pool`; column 3 is the number of the point
     table: Longs  # (slots, 4) open addressing: KEY of a block or -1, START, SIZE, MASK of the taken voxels
-    blocks: Longs  # (blocks, 2) KEY, LINK
-    cells: Longs  # (slots, 2) open addressing: KEY of a cell or -1, HEAD
+    cells: Longs  # (slots, 9) open addressing: KEY of a cell or -1, LAYER from below
     counts: Longs  # (4,) points, places, blocks, cells
 
 
@@ -71,7 +69,6 @@ def rehash(table: Longs, slots: int) -> Longs:
 @njit(cache=True)
 def open_block(store: Store, slot: int, i: int, j: int, k: int) -> None:
     """Open the block at block coordinates (i, j, k) in its free slot, and its cell if that is new."""
-    block = store.counts[2]
     store.counts[2] += 1
     store.table[slot, KEY] = pack(i, j, k)
     store.table[slot, START] = 0
@@ -80,12 +77,11 @@ def open_block(store: Store, slot: int, i: int, j: int, k: int) -> None:
     key = pack(i >> CELL_BITS, j >> CELL_BITS, k >> CELL_BITS)
     cell = find(store.cells, key)
     if store.cells[cell, KEY] == NONE:
-        store.cells[cell, KEY] = key
-        store.cells[cell, HEAD] = NONE
         store.counts[3] += 1
-    store.blocks[block, KEY] = pack(i, j, k)
-    store.blocks[block, LINK] = store.cells[cell, HEAD]
-    store.cells[cell, HEAD] = block
+        store.cells[cell, KEY] = key
+        for layer in range(CELL_BLOCKS):
+            store.cells[cell, LAYER + layer] = 0
+    store.cells[cell, LAYER + (k & 7)] |= 1 << ((i & 7) | ((j & 7) << 3))
 
 
 @njit(cache=True)
@@ -184,8 +180,7 @@ def empty_store() -> Store:
         pool=pool,
         pool_number=pool.view(np.int32),
         table=np.full((1024, 4), NONE, np.int64),
-        blocks=np.empty((1024, 2), np.int64),
-        cells=np.full((1024, 2), NONE, np.int64),
+        cells=np.full((1024, 1 + CELL_BLOCKS), NONE, np.int64),
         counts=np.zeros(4, np.int64),
     )
 
@@ -215,7 +210,6 @@ def with_room(store: Store, more: int) -> Store:
         pool=pool,
         pool_number=pool.view(np.int32),
         table=roomier(store.table, blocks),
-        blocks=grown(store.blocks, blocks),
         cells=roomier(store.cells, cells),
         counts=store.counts,
     )

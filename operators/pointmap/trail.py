@@ -11,6 +11,8 @@ import numpy.typing as npt
 from graph.geometry import Matrix, exponential, interpolate, inverse
 from operators.pointmap.deskew import deskew
 
+LEVEL = 1e-9  # metres, or one minus the cosine of a tilt
+
 
 class Trail:
     """The last two poses of the odometry, and its last velocity."""
@@ -38,6 +40,10 @@ class Trail:
         if stamp <= first:
             return self.poses[0]
         return interpolate(self.poses[0], self.poses[-1], (stamp - first) / (last - first))
+
+    def level(self) -> bool:
+        """Say whether the odometry knows no height and no tilt: then the robot drives on one level floor."""
+        return all(abs(pose[2, 3]) < LEVEL and abs(pose[2, 2] - 1.0) < LEVEL for pose in self.poses)
 
     def motion(self, seconds: float) -> Matrix:
         """Return now_from_then (4, 4) of the base over so many seconds of steady driving and turning."""
