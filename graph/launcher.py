@@ -27,7 +27,7 @@ from graph.status import StatusLine
 from graph.threads import environment
 from graph.transport import Sample, Wire, free_port
 from graph.wiring import NodeSpec, wire
-from graph.worker import Boot, Control, State
+from graph.words import Boot, Control, State
 
 DRAIN = 5.0  # seconds that a stopped run gets to come to rest
 LEAVE = 10.0  # seconds that a process gets to write its footer and go

@@ -12,7 +12,6 @@ import threading
 import time
 import traceback
 from pathlib import Path
-from typing import Literal
 
 import msgspec
 
@@ -25,43 +24,11 @@ from graph.realtime import Realtime
 from graph.shard import Shard, schemas_of
 from graph.threads import set_threads
 from graph.transport import Sample, Wire
-from graph.wiring import NodeSpec
+from graph.words import Boot, Control, Phase, State
 
 GAP_PATIENCE = 5.0  # seconds of the consumer's own running time
 STATE_PERIOD = 0.1  # seconds between two reports to the launcher
 FLOW_PARTS = 4  # a consumer reports its watermark upstream each quarter of `ahead`
-
-
-class Boot(msgspec.Struct):
-    """What the launcher tells a new process."""
-
-    spec: NodeSpec
-    endpoint: str
-    prefix: str
-    shard: str
-    incarnation: int = 0
-    log_level: str = "warning"
-
-
-class Control(msgspec.Struct):
-    """A word of the launcher to all operators."""
-
-    kind: Literal["start", "pause", "end", "stop", "finish", "exit"]
-    stamp: int = 0  # start: the start on the monotonic clock; end: the last stamp of the run
-
-
-class State(msgspec.Struct):
-    """An operator's report to the launcher: how far it is, and how long its latest calls took."""
-
-    phase: Literal["running", "paused", "idle", "finished"]
-    stamp: int  # of the last call
-    steps: int
-    durations: tuple[int, ...] = ()  # nanoseconds, of the calls since the last report
-    counts: tuple[int, ...] = ()  # messages put, by output port
-    received: dict[str, int] = msgspec.field(default_factory=dict)  # by topic
-    dormant: bool = False  # lockstep: nothing to do but what others may send
-    end: int | None = None  # this operator's End, where it ends the run
-    skipped: int = 0
 
 
 class Worker:
@@ -76,7 +43,7 @@ class Worker:
         self.lockstep = Lockstep(self.spec) if self.spec.mode == "lockstep" and self.spec.kind != "sink" else None
         self.realtime = None if self.lockstep else Realtime(self.spec)
         self.emissions: list[Emission] = []
-        self.phase: Literal["running", "paused", "idle", "finished"] = "running"
+        self.phase: Phase = "running"
         self.origin: int | None = None  # the start of the run on the monotonic clock
         self.closing = False  # realtime: on_end shall run
         self.leaving = False

@@ -1,0 +1,43 @@
+"""What the launcher and the process of an operator say to each other."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+from graph.wiring import NodeSpec
+
+Phase = Literal["running", "paused", "idle", "finished"]
+
+
+class Boot(msgspec.Struct):
+    """What the launcher tells a new process."""
+
+    spec: NodeSpec
+    endpoint: str
+    prefix: str
+    shard: str
+    incarnation: int = 0
+    log_level: str = "warning"
+
+
+class Control(msgspec.Struct):
+    """A word of the launcher to all operators."""
+
+    kind: Literal["start", "pause", "end", "stop", "finish", "exit"]
+    stamp: int = 0  # start: the start on the monotonic clock; end: the last stamp of the run
+
+
+class State(msgspec.Struct):
+    """An operator's report to the launcher: how far it is, and how long its latest calls took."""
+
+    phase: Phase
+    stamp: int  # of the last call
+    steps: int
+    durations: tuple[int, ...] = ()  # nanoseconds, of the calls since the last report
+    counts: tuple[int, ...] = ()  # messages put, by output port
+    received: dict[str, int] = msgspec.field(default_factory=dict)  # by topic
+    dormant: bool = False  # lockstep: nothing to do but what others may send
+    end: int | None = None  # this operator's End, where it ends the run
+    skipped: int = 0
