@@ -12,6 +12,7 @@ from operators.navigation.obstacles import (
     FIRST_ELEVATION,
     LIFE,
     NOTHING,
+    SLOWLY,
     ObstacleLayer,
     panorama,
 )
@@ -101,6 +102,20 @@ def test_blind_ring_is_remembered_until_rays_pass():
     for _ in range(LIFE):
         obstacles.observe(wall_with_post(6.0), planar(0.7, 0.0, 0.0, HEIGHT))
     assert near(filled(obstacles), 1.2, 0.0) == 0
+
+
+def test_who_came_near_and_went_leaves_nothing_overhead_or_below():
+    """At 0.5 m the beams see 0.35 to 0.73 m above the floor; head and feet of a person were seen from farther away."""
+    obstacles = layer()
+    person = rays(lambda a: np.where(np.abs(a) < 0.15, 1.5, 6.0))
+    obstacles.observe(person, planar(0.0, 0.0, 0.0, HEIGHT))
+    heights = [level for level in range(11) if obstacles._life[..., level].any()]
+    assert len(heights) >= 9
+    free = rays(lambda a: np.full_like(a, 6.0))
+    free = free[np.abs(free[:, 2] / np.hypot(free[:, 0], free[:, 1])) < 0.2]  # ten beams of the middle alone
+    for _ in range(LIFE * SLOWLY):
+        obstacles.observe(free, planar(1.0, 0.0, 0.0, HEIGHT))
+    assert near(filled(obstacles), 1.5, 0.0) == 0
 
 
 def test_hidden_things_are_remembered():

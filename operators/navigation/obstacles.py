@@ -2,8 +2,9 @@
 
 Each column of the raster holds eleven voxels, 0.1 m high, from 0.1 to 1.2 m above the floor. A hit fills its voxel and
 leaves its height there. A frame's rays, gathered in a panorama of nearest ranges, wear off each voxel that they pass at
-that height (a table's edge is thinner than a voxel); after LIFE frames it is empty. Nothing is forgotten for not being
-seen: what enters the lidar's blind ring, or hides behind something, stays.
+that height (a table's edge is thinner than a voxel); after LIFE frames it is empty. What enters the lidar's blind ring,
+or hides behind something, stays. But near the robot the lidar looks only through the middle of a column: where a level
+ray passes, what was seen overhead wears off too (a person who went), and slowly what was seen below (feet, a low box).
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ LOWEST, HIGHEST = 0.1, 1.2  # metres above the floor: what the robot can hit
 LEVEL = 0.1  # metres
 LEVELS = 11
 LIFE = 5  # frames of looking through a voxel that empty it
+SLOWLY = 8  # frames that count as one for what lies below the beams: a low box is remembered for 4 s
+OVERHEAD = 0.15  # metres above the lidar: more than a table is
 SLOPE = 0.005  # metres a metre: how much the floor may seem to rise with distance, by a tilt of the pose
 
 SECTORS = 1080  # a third of a degree, one cell at 8.6 m
@@ -87,6 +90,7 @@ def wear(
     corner: tuple[float, float],
     resolution: float,
     box: Box,
+    slowly: bool,
 ) -> None:
     """Take life from the voxels within a box of cells that this frame's rays passed through."""
     margin = 2.0 * resolution
@@ -95,6 +99,8 @@ def wear(
             if not filled[row, column]:
                 continue
             world_x, world_y = corner[0] + (column + 0.5) * resolution, corner[1] + (row + 0.5) * resolution
+            lidar_x, lidar_y, _ = _moved(lidar_from_world, world_x, world_y, floor + 0.5 * (LOWEST + HIGHEST))
+            level_ray, _, _ = _glance(image, lidar_x, lidar_y, 0.0, margin)
             emptied, seen, remaining = False, False, False
             for level in range(LEVELS):
                 if life[row, column, level] == 0:
@@ -105,6 +111,8 @@ def wear(
                 if passed and not ended:
                     life[row, column, level] -= 1
                     emptied = emptied or life[row, column, level] == 0
+                elif level_ray and not (ended or covered) and (z > OVERHEAD or (z < 0.0 and slowly)):
+                    life[row, column, level] -= 1
                 if life[row, column, level] > 0:
                     seen = seen or passed or ended or covered
                     remaining = True
@@ -195,6 +203,7 @@ class ObstacleLayer:
         """Start empty. reach: metres around the lidar within which things are entered and removed."""
         self.lattice = lattice
         self.reach = reach
+        self.frame = 0
         shape = lattice.rows, lattice.columns
         self._life = np.zeros((*shape, LEVELS), np.uint8)
         self._height = np.zeros((*shape, LEVELS), np.uint8)  # of the last hit, in 255ths of a level
@@ -216,13 +225,14 @@ class ObstacleLayer:
 
         Returns the cells among which something may have changed.
         """
+        self.frame += 1
         pose = np.array(world_from_lidar, np.float64)  # a copy: messages are read-only, which is another type to numba
         points = np.array(points, np.float32)
         row, column = self.lattice.cell(pose[0, 3], pose[1, 3])
         box = Box(row, row + 1, column, column + 1).grown(math.ceil(self.reach / self.lattice.resolution), self.lattice)
         layers = self._life, self._height, self.filled
         place = self.lattice.origin, self.lattice.resolution
-        wear(*layers, panorama(points), inverse(pose), floor, *place, box)
+        wear(*layers, panorama(points), inverse(pose), floor, *place, box, self.frame % SLOWLY == 0)
         strike(*layers, points, pose, floor, *place, self.reach)
         look(self.seen, points, pose, floor, *place, LOOK)
         return box
