@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import queue
 import secrets
@@ -82,7 +83,9 @@ class Child:
         self.process.wait()
 
     def close(self) -> None:
-        """Wait for the last line of the log."""
+        """End what the process has started and left behind, and wait for the last line of the log."""
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.process.pid, signal.SIGKILL)  # its session began with it
         self.reader.join(timeout=2.0)
 
 
