@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
 from graph.codec import decode, digest, encode
 from graph.contract import End, Operator, Source, Summary, ports_of
@@ -34,6 +35,12 @@ class OutputError(TypeError):
 
 
 Emit = Callable[[Emission], None]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, (np.generic, np.ndarray)):
+        return value.tolist()
+    raise OutputError(f"a Summary holds numbers by name, and dicts of them; it was given a {type(value).__name__}")
 
 
 def build_operator(spec: NodeSpec) -> Operator:
@@ -155,7 +162,7 @@ class Node:
         if result is None:
             return
         if isinstance(result, Summary) and port == END:
-            self.summary = result
+            self.summary = Summary(msgspec.to_builtins(dict(result), enc_hook=_plain))
             return
         if isinstance(result, msgspec.Struct):
             yield result
