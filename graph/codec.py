@@ -60,12 +60,12 @@ def _encode(message: msgspec.Struct) -> bytes:
             return _PLACE
         return _pack_array(value)
 
-    encoded = msgspec.msgpack.encode(message, enc_hook=pack)
+    encoded = msgspec.msgpack.encode(message, enc_hook=pack, order="deterministic")
     if not large:
         return encoded
     between = encoded.split(_PLACE_BYTES)
     if len(between) != len(large) + 1:  # the message happens to hold the bytes of a place holder
-        return msgspec.msgpack.encode(message, enc_hook=_pack_array)
+        return msgspec.msgpack.encode(message, enc_hook=_pack_array, order="deterministic")
     pieces: list[bytes | memoryview] = [between[0]]
     for (head, data), rest in zip(large, between[1:], strict=True):
         pieces += (_EXT_32.pack(0xC9, len(head) + len(data), ARRAY_EXTENSION), head, data, rest)
