@@ -57,12 +57,12 @@ class Local:
             stamp = self.node.peek()
             self.schedule.offer(INFINITY if stamp is None else stamp)
 
-    def advance(self) -> bool:
-        """Make one call if one is due; say whether one was."""
+    def advance(self, now: int) -> bool:
+        """Make one call if one is due; say whether one was. now: how far the run is, which is the clock of a sink."""
         schedule = self.schedule
         if self.done:
             return False
-        arrival = schedule.next() if isinstance(schedule, Lockstep) else schedule.next(INFINITY - 1)
+        arrival = schedule.next() if isinstance(schedule, Lockstep) else schedule.next(now)
         set_threads(self.spec.threads)
         if arrival is not None:
             step = self.node.handle(arrival, arrival.time, self.emit)
@@ -122,7 +122,7 @@ def launch_in_process(
             busy = False
             turn = list(locals_) if shuffle is None else order.sample(locals_, len(locals_))
             for item in turn:
-                busy |= item.advance()
+                busy |= item.advance(_now(locals_))
                 busy |= _spread(item, locals_)
             if all(item.schedule.dormant() for item in locals_ if isinstance(item.schedule, Lockstep)):
                 raise UserError(endless(graph.clock.end))
@@ -131,7 +131,7 @@ def launch_in_process(
                 raise RuntimeError("deadlock: no operator can go on; this is a bug of the runtime")
         for item in locals_:
             if isinstance(item.schedule, Realtime):
-                while item.advance():
+                while item.advance(_now(locals_)):
                     pass
                 item.write(item.node.finish(item.schedule.handled, item.emit, item.schedule.leave()))
             item.shard.close()
@@ -140,6 +140,10 @@ def launch_in_process(
     finally:
         shutil.rmtree(paths.shards, ignore_errors=True)
     return verdict, paths.recording
+
+
+def _now(locals_: list[Local]) -> int:
+    return max(0, *(item.schedule.handled for item in locals_ if isinstance(item.schedule, Lockstep)))
 
 
 def _spread(item: Local, locals_: list[Local]) -> bool:
