@@ -19,6 +19,7 @@ from graph.contract import End, Operator, Source, ports_of
 from graph.errors import UserError
 from graph.evolution import require_schema
 from graph.graphfile import Graph, OperatorEntry
+from graph.node import END
 from graph.recording import Recording
 from graph.shard import STEP, SUMMARY
 from graph.suggest import suggestion
@@ -42,7 +43,8 @@ class Playback(Source):
             said: list[Any] = []
             for entry in entries:
                 if entry.port == STEP:
-                    ended = entry.step().ended
+                    step = entry.step()
+                    ended = "the recording ends" if step.port == END else step.ended
                     said += [] if ended is None else [End(ended)]
                 else:
                     message = decode(entry.payload, types[entry.port])
