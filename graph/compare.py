@@ -62,7 +62,8 @@ def _array_differences(old: np.ndarray[Any, Any], new: np.ndarray[Any, Any], whe
     if not unequal.any():
         return
     first = np.unravel_index(int(np.argmax(unequal)), old.shape)
-    gap = np.abs(new.astype(np.float64) - old.astype(np.float64)).reshape(-1)[unequal]
+    with np.errstate(invalid="ignore", over="ignore"):  # infinity less infinity
+        gap = np.abs(new.astype(np.complex128) - old.astype(np.complex128)).reshape(-1)[unequal]
     largest = float(np.nanmax(gap)) if np.isfinite(gap).any() else None
     index = tuple(int(place) for place in first)
     yield Difference(where, index, _short(old[first]), _short(new[first]), largest, float(unequal.mean()))
