@@ -143,7 +143,7 @@ def launch_in_process(
 
 
 def _now(locals_: list[Local]) -> int:
-    return max(0, *(item.schedule.handled for item in locals_ if isinstance(item.schedule, Lockstep)))
+    return max([0, *(item.schedule.handled for item in locals_ if isinstance(item.schedule, Lockstep))])
 
 
 def _spread(item: Local, locals_: list[Local]) -> bool:

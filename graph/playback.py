@@ -44,8 +44,10 @@ class Playback(Source):
             for entry in entries:
                 if entry.port == STEP:
                     step = entry.step()
-                    ended = "the recording ends" if step.port == END else step.ended
-                    said += [] if ended is None else [End(ended)]
+                    if step.ended is not None:
+                        said.append(End(step.ended))
+                    elif step.port == END and not any(isinstance(item, End) for item in said):
+                        said.append(End("the recording ends"))
                 else:
                     message = decode(entry.payload, types[entry.port])
                     said.append(self.Outputs(**{entry.port: message}))
