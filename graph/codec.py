@@ -161,8 +161,11 @@ def encode(message: msgspec.Struct) -> bytes:
     """Encode a message. Raises CodecError, naming the field, if an array is not of the declared dtype and shape."""
     try:
         _check_struct(message, {}, type(message).__name__)
+    except (TypeError, AttributeError) as error:
+        raise CodecError(f"{type(message).__name__}: {error}") from error
+    try:
         return _encode(message)
-    except (TypeError, msgspec.MsgspecError) as error:
+    except (TypeError, ValueError, msgspec.MsgspecError) as error:
         raise CodecError(f"{type(message).__name__}: {error}") from error
 
 

@@ -34,7 +34,7 @@ def differences(recorded: Any, replayed: Any, where: str = "") -> Iterator[Diffe
             )
     elif isinstance(recorded, np.ndarray) and isinstance(replayed, np.ndarray):
         yield from _array_differences(recorded, replayed, where)
-    elif isinstance(recorded, dict) and isinstance(replayed, dict) and list(recorded) == list(replayed):
+    elif isinstance(recorded, dict) and isinstance(replayed, dict) and recorded.keys() == replayed.keys():
         for key, value in recorded.items():
             yield from differences(value, replayed[key], f"{where}.{key}" if where else str(key))
     elif isinstance(recorded, (list, tuple)) and isinstance(replayed, (list, tuple)) and len(recorded) == len(replayed):
