@@ -20,6 +20,8 @@ import numpy as np
 from graph.contract import End, Operator, Summary
 from graph.geometry import Matrix
 from graph.messages import Drive, Goal, Odometry, PointCloud, Pose, Tick, Truth
+from sim.lidar import LidarSpec
+from sim.odometry import OdometryNoise
 from sim.referee import Referee
 from sim.rehearsal import rehearse
 from sim.world import World
@@ -38,9 +40,10 @@ class Simulator(Operator):
         scenario: str = "easy"  # name or file
         tour: str = "A"
         seed: int = 0
-        lidar: str = "paper"  # a preset: paper, hdl32e
-        rolling: bool = False  # columns one after the other over the scan period
-        dropout: float = 0.0  # share of returns lost at grazing incidence and far away, at most
+        lidar: str | LidarSpec = "paper"  # a preset (paper, hdl32e), or the paper's with other measures
+        rolling: bool | None = None  # columns one after the other over the scan period; None: as the lidar says
+        dropout: float | None = None  # share of returns lost at grazing incidence and far away, at most
+        odometry: OdometryNoise = OdometryNoise()
         goal_radius: float = 0.9  # metres between the robot's own estimate and a target that it reaches
         patience: float = 5.0  # the tour ends after so many times its free driving time
 
@@ -55,7 +58,16 @@ class Simulator(Operator):
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
         c: Simulator.Config = self.config
-        self.world = World(c.building, c.scenario, c.tour, c.seed, lidar=c.lidar, rolling=c.rolling, dropout=c.dropout)
+        self.world = World(
+            c.building,
+            c.scenario,
+            c.tour,
+            c.seed,
+            lidar=c.lidar,
+            rolling=c.rolling,
+            dropout=c.dropout,
+            odometry=c.odometry,
+        )
         self.referee = Referee(self.world.targets, self.world.length, patience=c.patience, radius=c.goal_radius)
         self.command = (0.0, 0.0)
         self.now: int | None = None  # stamp of the last tick
@@ -138,4 +150,5 @@ class Simulator(Operator):
             collisions_with_people=collisions["people"],
             collisions_with_things=collisions["things"],
             people=len(self.world.person_truth),
+            people_still_there=self.world.still_there(),
         )

@@ -15,6 +15,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from graph.geometry import exponential, logarithm
+
 Array = npt.NDArray[np.float64]
 
 # Measures of the captured figure in metres, in its frame: x forward, y up, z right.
@@ -34,14 +36,10 @@ RADII = np.array(
 _HEAD_WIDTH = PARTS.index("head")
 
 
-class Pose(NamedTuple):
-    """Joint rotations (3, 3) of the captured figure, and its hips' sway about the straight line."""
-
-    root: Array
-    chest: Array
-    neck: Array
-    right: tuple[Array, Array, Array, Array, Array]  # hip, knee, ankle, shoulder, elbow
-    left: tuple[Array, Array, Array, Array, Array]
+# A pose is the rotations (13, 3, 3) of these joints of the captured figure, each in its parent's frame.
+_ROOT, _CHEST_JOINT, _NECK_JOINT = 0, 1, 2
+_RIGHT, _LEFT = 3, 8  # first of hip, knee, ankle, shoulder, elbow
+_SHARES = 9  # steps between standing and walking in the table of poses
 
 
 def _about_z(angle: float) -> Array:
@@ -60,25 +58,26 @@ def _quaternion(values: npt.ArrayLike) -> Array:
     )
 
 
-def _capsules(pose: Pose) -> Array:
+def _capsules(pose: Array) -> Array:
     """Return the ends (16, 2, 3) of the capsules by forward kinematics, the lowest point of the feet on the floor."""
-    root, chest = pose.root, pose.root @ pose.chest
+    root, chest = pose[_ROOT], pose[_ROOT] @ pose[_CHEST_JOINT]
     chest_at = root @ np.array(_CHEST)
     neck_at = chest_at + chest @ np.array(_NECK)
-    neck = chest @ pose.neck
+    neck = chest @ pose[_NECK_JOINT]
     hip_line = root @ np.array([0.0, 0.0, 0.075])
     shoulder_line = chest @ np.array([0.0, 0.0, 0.13])
     shoulder_at = chest_at + chest @ np.array([-0.01, 0.205, 0.0])
-    side = chest @ np.array([0.0, 0.0, 0.07])
+    side, rise = chest @ np.array([0.0, 0.0, 0.07]), chest @ np.array([0.0, 0.14, 0.0])
     ends = [
         (hip_line, -hip_line),
-        (root @ np.array([0.0, 0.06, 0.0]), chest_at + chest @ np.array([0.0, 0.02, 0.0])),
-        (chest_at + side, chest_at + chest @ np.array([0.0, 0.14, 0.0]) + side),
-        (chest_at - side, chest_at + chest @ np.array([0.0, 0.14, 0.0]) - side),
+        (root @ np.array([0.0, 0.06, 0.0]), root @ np.array([0.0, 0.25, 0.0])),
+        (chest_at + side, chest_at + rise + side),
+        (chest_at - side, chest_at + rise - side),
         (shoulder_at + shoulder_line, shoulder_at - shoulder_line),
         (neck_at + neck @ np.array([0.01, 0.10, 0.0]), neck_at + neck @ np.array([0.02, 0.19, 0.0])),
     ]
-    for mirror, (hip, knee, ankle, shoulder, elbow) in ((1.0, pose.right), (-1.0, pose.left)):
+    for mirror, first in ((1.0, _RIGHT), (-1.0, _LEFT)):
+        hip, knee, ankle, shoulder, elbow = pose[first : first + 5]
         flip = np.array([1.0, 1.0, mirror])
         hip_at, thigh = root @ (np.array(_HIP) * flip), root @ hip
         knee_at, shank = hip_at + thigh @ np.array(_KNEE), thigh @ knee
@@ -98,22 +97,24 @@ def _capsules(pose: Pose) -> Array:
 
 
 def _limp(hip: float = 0.0, knee: float = 0.0, shoulder: float = 0.0, elbow: float = 0.15, lean: float = 0.0) -> Array:
-    joints = (_about_z(hip), _about_z(knee), _about_z(-hip - knee), _about_z(shoulder), _about_z(elbow))
-    return _capsules(Pose(np.eye(3), _about_z(lean), np.eye(3), joints, joints))
+    """Return a pose with both sides alike, arms a little off the body; angles in radians, forward positive."""
+    pose = np.broadcast_to(np.eye(3), (13, 3, 3)).copy()
+    pose[_CHEST_JOINT] = _about_z(lean)
+    for first, spread in ((_RIGHT, -0.06), (_LEFT, 0.06)):
+        arm = exponential([spread, 0.0, 0.0]) @ _about_z(shoulder)
+        pose[first : first + 5] = _about_z(hip), _about_z(knee), _about_z(-hip - knee), arm, _about_z(elbow)
+    return pose
 
 
-def _relaxed(capsules: Array, names: tuple[str, ...], outward: float) -> Array:
-    """Move the arms' ends outward (fractions of the stature), so that they hang beside the body."""
-    for name in names:
-        capsules[PARTS.index(f"right {name}"), :, 1] -= outward
-        capsules[PARTS.index(f"left {name}"), :, 1] += outward
-    return capsules
+def _between(a: Array, b: Array, share: float) -> Array:
+    """Turn every joint by a share of the way from pose a to pose b, so that limbs keep their lengths."""
+    return np.array([one @ exponential(share * logarithm(one.T @ other)) for one, other in zip(a, b, strict=True)])
 
 
 class Gait(NamedTuple):
-    """One stride as capsules, and how far it goes; all for stature 1."""
+    """One stride as capsules, from standing (first) to walking (last), and how far it goes; all for stature 1."""
 
-    capsules: Array  # (phases, 16, 2, 3), the first phase again at the end
+    capsules: Array  # (shares, phases, 16, 2, 3), the first phase again at the end
     stride: float
 
 
@@ -124,39 +125,33 @@ def walking() -> Gait:
 
     source = Path(pybullet_data.getDataPath()) / "data" / "motions" / "humanoid3d_walk.txt"
     frames = np.array(json.loads(source.read_text(encoding="utf-8"))["Frames"], np.float64)
-    poses = []
-    for frame in frames:
-        values = frame[1:]  # without the duration
-        right = (_quaternion(values[15:19]), _about_z(values[19]), _quaternion(values[20:24]))
-        right_arm = (_quaternion(values[24:28]), _about_z(values[28]))
-        left = (_quaternion(values[29:33]), _about_z(values[33]), _quaternion(values[34:38]))
-        left_arm = (_quaternion(values[38:42]), _about_z(values[42]))
-        root = _quaternion(values[3:7])
-        poses.append(
-            _capsules(
-                Pose(
-                    root,
-                    _quaternion(values[7:11]),
-                    _quaternion(values[11:15]),
-                    (*right, *right_arm),
-                    (*left, *left_arm),
-                )
-            )
-        )
-    stride = float(frames[-1, 1] - frames[0, 1]) / _STATURE
-    return Gait(np.array([*poses[:-1], poses[0]]), stride)
+    # a frame: duration, 3 of position, then the joints in our order: knees and elbows one angle, else a quaternion
+    stances = []
+    for frame in frames[:-1]:
+        pose, at = np.empty((13, 3, 3)), 4
+        for joint in range(13):
+            hinge = joint in (_RIGHT + 1, _RIGHT + 4, _LEFT + 1, _LEFT + 4)
+            pose[joint] = _about_z(frame[at]) if hinge else _quaternion(frame[at : at + 4])
+            at += 1 if hinge else 4
+        stances.append(pose)
+    upright = _limp(elbow=0.2)
+    table = []
+    for share in np.linspace(0.0, 1.0, _SHARES):
+        phases = [_capsules(_between(upright, stance, float(share))) for stance in stances]
+        table.append([*phases, phases[0]])
+    return Gait(np.array(table), float(frames[-1, 1] - frames[0, 1]) / _STATURE)
 
 
 @functools.cache
 def standing() -> Array:
     """Return the capsules (16, 2, 3) of a standing figure of stature 1."""
-    return _relaxed(_limp(elbow=0.2), ("upper arm", "lower arm"), 0.01)
+    return np.asarray(walking().capsules[0, 0])
 
 
 @functools.cache
 def sitting() -> Array:
     """Return the capsules (16, 2, 3) of a figure of stature 1 that sits; its hips are above the origin."""
-    return _limp(hip=np.pi / 2 - 0.05, knee=-np.pi / 2 + 0.05, shoulder=0.55, elbow=1.0, lean=-0.05)
+    return _capsules(_limp(hip=np.pi / 2 - 0.05, knee=-np.pi / 2 + 0.05, shoulder=0.55, elbow=1.0, lean=-0.05))
 
 
 def radii(height: npt.ArrayLike, build: npt.ArrayLike) -> Array:
@@ -173,12 +168,14 @@ def figures(phase: Array, stride_share: Array, height: Array) -> Array:
     height: metres.
     """
     table = walking().capsules
-    position = (phase % 1.0) * (len(table) - 1)
-    index = np.minimum(position.astype(np.int64), len(table) - 2)
-    fraction = (position - index)[:, None, None, None]
-    walk = table[index] * (1.0 - fraction) + table[index + 1] * fraction
-    share = stride_share[:, None, None, None]
-    return (walk * share + standing() * (1.0 - share)) * height[:, None, None, None]
+    position = (phase % 1.0) * (table.shape[1] - 1)
+    index = np.minimum(position.astype(np.int64), table.shape[1] - 2)
+    level = np.clip(stride_share, 0.0, 1.0) * (_SHARES - 1)
+    row = np.minimum(level.astype(np.int64), _SHARES - 2)
+    u, v = (position - index)[:, None, None, None], (level - row)[:, None, None, None]
+    low = table[row, index] * (1.0 - u) + table[row, index + 1] * u
+    high = table[row + 1, index] * (1.0 - u) + table[row + 1, index + 1] * u
+    return (low * (1.0 - v) + high * v) * height[:, None, None, None]
 
 
 def placed(capsules: Array, x: Array, y: Array, heading: Array) -> Array:

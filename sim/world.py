@@ -1,14 +1,14 @@
 """One session: a building, its furniture and people, and the robot in it.
 
 world = World("default", "easy", "A", seed=1)
-frame = world.step(linear=0.5, angular=0.0)
+frame = world.step(linear=0.5, angular=0.0)  # or world.step(drive) with a Drive
 """
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import msgspec
 import numpy as np
@@ -35,6 +35,16 @@ GROUND = 0.05  # metres: everything below is ground, as in the paper's simulator
 ENCOUNTER = 1.0  # seconds without touch after which a contact counts as a new one
 FLOOR = 100.0  # metres of floor around the building
 ROOM_CELL = 0.2  # metres, of the grid that tells who is in which room
+
+
+class Drive(Protocol):
+    """A velocity command: m/s forward, rad/s to the left."""
+
+    @property
+    def linear(self) -> float: ...
+
+    @property
+    def angular(self) -> float: ...
 
 
 class Frame(NamedTuple):
@@ -173,8 +183,10 @@ class World:
         walkers = placed(walkers, crowd.position[:, 0], crowd.position[:, 1], crowd.facing)
         return np.concatenate([walkers, self.sitters])
 
-    def step(self, linear: float, angular: float, seconds: float = 0.1) -> Frame:
-        """Drive for a while, then scan. linear: m/s, angular: rad/s."""
+    def step(self, linear: float | Drive, angular: float = 0.0, seconds: float = 0.1) -> Frame:
+        """Drive for a while, then scan. linear: m/s, or a command of both; angular: rad/s."""
+        if not isinstance(linear, (int, float)):
+            linear, angular = linear.linear, linear.angular
         self.advance(linear, angular, seconds)
         return self.scan()
 
@@ -271,6 +283,12 @@ class World:
             moving=moves[body],
             instance=body,
         )
+
+    def still_there(self) -> float:
+        """Return the share of the walkers that is in one of the populated rooms, where all of them began."""
+        populated = [index for index, room in enumerate(self.building.rooms) if room.populated]
+        here = np.isin(self.rooms_of(self.crowd.position), populated)
+        return float(here.mean()) if len(here) else 1.0
 
     def state(self) -> State:
         """Say what is true now, and what the odometry says."""

@@ -158,6 +158,13 @@ def test_feet_stay_on_the_floor_and_do_not_slide() -> None:
     assert np.median(slide) < 0.35 * gait.stride * 1.7 / 200  # and then is slower than the body by far
 
 
+def test_limbs_keep_their_lengths() -> None:
+    rng = np.random.default_rng(1)
+    poses = figures(rng.random(400), rng.random(400), np.full(400, 1.7))
+    lengths = np.linalg.norm(poses[:, :, 1] - poses[:, :, 0], axis=2)
+    assert ((lengths.max(0) - lengths.min(0)) / lengths.mean(0)).max() < 0.01
+
+
 def test_figures_have_human_measures() -> None:
     tall = standing() * 1.8
     head = tall[PARTS.index("head"), :, 2].max() + radii(np.array([1.8]), np.ones(1))[0, PARTS.index("head")]

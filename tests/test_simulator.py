@@ -11,6 +11,7 @@ import pytest
 from graph import End, Summary
 from graph.codec import decode, encode
 from graph.contract import ports_of
+from graph.loading import build_config
 from graph.messages import Drive, Goal, Odometry, PointCloud, Pose, Tick, Truth
 from operators.simulator import Simulator
 
@@ -152,6 +153,23 @@ def test_it_asks_for_the_rate_of_its_lidar(files: tuple[Path, str]) -> None:
     tick(skipped, 0)
     tick(skipped, 3)  # in realtime a tick may be missed
     assert skipped.world.time == pytest.approx(0.3)
+
+
+def test_lidar_and_odometry_are_settings(files: tuple[Path, str]) -> None:
+    config = build_config(
+        Simulator,
+        {"building": str(files[0]), "scenario": files[1], "lidar": {"beams": 16, "columns": 180, "rolling": True}}
+        | {"odometry": {"wheel_scale": 0.0, "gyro_bias": 0.3}},
+        files[0].parent,
+    )
+    simulator = Simulator(config)
+    said, _ = tick(simulator, 0)
+    assert said.frame is not None
+    assert said.frame.ring is not None
+    assert said.frame.ring.max() == 15
+    assert len(said.frame.points) <= 16 * 180
+    assert said.frame.time_offset is not None
+    assert simulator.world.odometer.scale == 1.0
 
 
 def test_two_simulators_of_one_config_agree_to_the_bit() -> None:
