@@ -1,0 +1,67 @@
+"""The helpers for tests: an operator on hand-made messages, a recording against its text."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from graph.recording import Recording
+from graph.testing import reference, run_operator
+from tests.conftest import ROOT
+from tests.sample_operators import Adder, Count, Failing, Relay
+
+pytest_plugins = ["pytester"]
+
+Record = Callable[..., Recording]
+
+
+def count(value: int, at: int = 0) -> Count:
+    return Count(measured_at=at, value=value)
+
+
+def test_an_operator_runs_on_hand_made_messages() -> None:
+    said = run_operator(Adder, [("left", count(3)), ("right", count(4, 7))], Adder.Config(scale=2.0))
+    assert [(port, message.value, message.measured_at) for port, message in said] == [("sum", 14.0, 7)]
+    with pytest.raises(KeyError, match="Adder has no input 'middle'; it has left, right"):
+        run_operator(Adder, [("middle", count(1))])
+    with pytest.raises(RuntimeError, match="failed at 5"):
+        run_operator(Failing, [("count", count(5))])
+    assert run_operator(Relay, []) == []
+
+
+def test_a_reference_says_what_a_recording_says(record: Record) -> None:
+    text = reference(record())
+    assert text == reference(record(name="again.mcap"))
+    assert "counter/count: 30 messages" in text
+    assert "counter/count.value: mean 14.5" in text
+    assert "screen" not in text
+    assert text != reference(record(name="other.mcap", sets=("relay.offset=100",)))
+
+
+def test_the_marker_holds_a_recording_against_its_text(
+    record: Record, pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = record()
+    monkeypatch.chdir(pytester.path)
+    (pytester.path / "run.mcap").write_bytes(recording.path.read_bytes())
+    pytester.makepyfile(
+        """
+        import pytest
+
+        @pytest.mark.replay("run.mcap")
+        def test_run(replayed):
+            assert replayed.equal
+        """
+    )
+    pytester.makeini("[pytest]\naddopts = -p graph.testing")
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    missing = pytester.runpytest_subprocess()
+    missing.stdout.fnmatch_lines(["*run.txt is missing; pytest --update-references writes it*"])
+    assert pytester.runpytest_subprocess("--update-references").ret == 0
+    assert pytester.runpytest_subprocess().ret == 0
+    text = Path(pytester.path / "run.txt")
+    text.write_text(text.read_text().replace("30 messages", "31 messages"))
+    changed = pytester.runpytest_subprocess()
+    changed.stdout.fnmatch_lines(["*run.txt says something else*"])
