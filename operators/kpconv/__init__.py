@@ -1,0 +1,7 @@
+"""KPConv (Thomas et al. 2019) on two CPU cores: input pyramids, KPFCNN, training, and inference at the lidar's rate.
+
+classifier = load_classifier(Path("weights.safetensors"))  # operators.kpconv.classifier
+classified = classifier.classify(points_lidar, base_from_lidar)
+
+Nothing is imported here, so that what needs no torch does not load it.
+"""

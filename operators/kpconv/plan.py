@@ -22,6 +22,7 @@ class Plan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rate: float = 3e-3  # largest learning rate; the authors': 1e-2, by sgd
     momentum: float = 0.98  # of sgd
     decay: float = 1e-3  # of weights
+    balance: float = 0.5  # points weigh as their class's share of the batch to the power of minus this; the authors': 0
     schedule: Literal["cosine", "authors"] = "cosine"
     check: int = 250  # steps between two looks at the held-out session
     patience: int = 6  # looks without a better mean recall after which training stops

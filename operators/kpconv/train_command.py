@@ -31,6 +31,7 @@ from operators.kpconv.training import Group, Progress, Trainer
 from operators.kpconv.weights import Header, WeightsError, save
 
 PREFERRED = "annotator/labelled"
+NUMBERS = ("batch", "seed", "check", "patience", "rate", "momentum", "decay", "balance")  # of a Plan
 MOST_FRAMES = 3000  # in memory: 250 kB each
 
 
@@ -48,9 +49,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--steps", type=int, help="default: 3000")
     length.add_argument("--budget", metavar="TIME", help="such as 20min: fixes the steps by timing the first ones")
-    for name in ("batch", "seed", "check", "patience"):
+    for name in NUMBERS[:4]:
         parser.add_argument(f"--{name}", type=int, default=Plan.__struct_defaults__[_place(name)])
-    for name in ("rate", "momentum", "decay"):
+    for name in NUMBERS[4:]:
         parser.add_argument(f"--{name}", type=float, default=Plan.__struct_defaults__[_place(name)])
     parser.add_argument("--optimizer", choices=("sgd", "adamw"), default="adamw")
     parser.add_argument("--schedule", choices=("cosine", "authors"), default="cosine")
@@ -140,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--budget: {error}") from error
     plan = Plan(
         steps=10**9 if budget is not None else (args.steps or 3000),
-        **{name: getattr(args, name) for name in ("batch", "seed", "check", "patience", "rate", "momentum", "decay")},
+        **{name: getattr(args, name) for name in NUMBERS},
         optimizer=args.optimizer,
         schedule=args.schedule,
         processes=group.size,

@@ -132,13 +132,18 @@ class Trainer:
                 module.momentum = self.plan.statistics_at(self.state.step)
         self.optimizer.zero_grad()
         logits = self.model(inputs)
-        loss = nn.functional.cross_entropy(logits, targets, ignore_index=IGNORED)
+        loss = nn.functional.cross_entropy(logits, targets, self.weights_of(targets), ignore_index=IGNORED)
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
         known = targets != IGNORED
         pairs = targets[known] * len(CLASSES) + logits.detach().argmax(1)[known]
         self.confusion += torch.bincount(pairs.cpu(), minlength=len(CLASSES) ** 2).view_as(self.confusion)
         return float(loss.detach())
+
+    def weights_of(self, targets: Tensor) -> Tensor:
+        """Return a weight for each class: rarer ones get more."""
+        counts = torch.bincount(targets[targets != IGNORED], minlength=len(CLASSES)).clamp(min=1)
+        return (counts.sum() / counts).float() ** self.plan.balance
 
     def batches(self) -> Iterator[tuple[Any, float]]:
         """Yield each step's batch and the seconds that it was waited for; batches are made ahead by another thread."""
