@@ -1,4 +1,4 @@
-"""The schedule of realtime against a clock that the test turns: order, queues, ticks, deadlines, every message noted."""
+"""The schedule of realtime against a clock that the test turns: order, queues, ticks, deadlines, nothing unnoted."""
 
 from __future__ import annotations
 
