@@ -22,7 +22,7 @@ ROBOT_RADIUS = 0.30  # metres: the circle around the robot's footprint, and a li
 NEAR_PATH = 0.8  # metres: doors this near to the tour's way stand open
 KEEP_CLEAR = 0.75  # metres between furniture and the way of the tour
 TARGET_CLEAR = 0.65  # metres between furniture and a target
-DETOUR = 1.1  # times the shortest way that a tour goes so as to pass the tables by
+DETOUR = 3.0  # metres more that a tour goes to a target so as to pass the tables by
 WALL_CLEAR = 0.10  # metres between furniture and walls
 CLOSED_SHARE = 0.3  # of the doors that are on nobody's way
 CHAIR_MODELS = ("school", "dining", "slatted", "shell", "armchair", "sled")
@@ -49,12 +49,8 @@ def draw(building: Building, scenario: Scenario, tour: str, seed: int) -> Layout
     """Draw one session's layout. Raises BuildingError if a target of the tour cannot be reached."""
     rng = np.random.default_rng([seed, 1])
     bounds = building.bounds()
-    walls = wall_bodies(building)
-    shell = walls + fixed_leaves(building)
-    empty = clearance(shell, bounds, RESOLUTION)
-    furnished = clearance(shell + _reserved(building), bounds, RESOLUTION)
-    way = tour_way(building, tour, empty, furnished)
-    bodies = [*walls, *_leaves(building, way, rng)]
+    way = tour_way(building, tour)
+    bodies = [*wall_bodies(building), *_leaves(building, way, rng)]
     targets = np.array([building.start_pose(tour)[:2], *building.tours[tour].targets])
     site = _Site(clearance(bodies, bounds, RESOLUTION), way, targets)
     seats: list[Seat] = []
@@ -71,19 +67,22 @@ def draw(building: Building, scenario: Scenario, tour: str, seed: int) -> Layout
     return Layout(bodies, seats, clearance(bodies, bounds, RESOLUTION), way)
 
 
-def tour_way(building: Building, tour: str, empty: Clearance, furnished: Clearance | None = None) -> Array:
-    """Find the way (n, 2) of the robot from the start through all targets; past `furnished` tables where it can.
+def tour_way(building: Building, tour: str) -> Array:
+    """Find the way (n, 2) of the robot from the start through all targets, past the tables' places where it can.
 
     Raises BuildingError by tour and target where the empty building has no way.
     """
+    shell, bounds = wall_bodies(building) + fixed_leaves(building), building.bounds()
+    empty = clearance(shell, bounds, RESOLUTION)
+    furnished = clearance(shell + _reserved(building), bounds, RESOLUTION)
     at = building.start_pose(tour)[:2]
     legs = []
     for index, target in enumerate(building.tours[tour].targets):
         leg = route(empty, at, target, radius=ROBOT_RADIUS)
         if leg is None:
             raise BuildingError(f"building {building.name}, tour {tour}: target {index} at {target} cannot be reached")
-        around = None if furnished is None else route(furnished, at, target, radius=ROBOT_RADIUS)
-        longest = DETOUR * length_of(leg)
+        around = route(furnished, at, target, radius=ROBOT_RADIUS)
+        longest = length_of(leg) + DETOUR
         legs.append(leg if around is None or length_of(around) > longest else around)
         at = target
     if not legs:
