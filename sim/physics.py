@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import weakref
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -198,18 +198,22 @@ class Physics:
         """
         names = {-1: -1, self.floor: 0} | {number: 1 + index for number, index in self.still.items()}
         names |= {number: 1 + len(self.still) + person for number, person in self.owner.items()}
-        share, met = np.ones(len(origins)), np.full(len(origins), -1, np.int32)
+        hits = self.ray_batches(origins.tolist(), ends.tolist())
+        return np.array([hit[2] for hit in hits]), np.array([names[hit[0]] for hit in hits], np.int32)
+
+    def ray_batches(self, origins: list[list[float]], ends: list[list[float]]) -> list[tuple[Any, ...]]:
+        """Cast rays and return PyBullet's own tuples: number of the body, link, share of the way, and so on."""
+        hits: list[tuple[Any, ...]] = []
         for first in range(0, len(origins), BATCH):
             part = slice(first, first + BATCH)
-            hits = p.rayTestBatch(
-                origins[part].tolist(),
-                ends[part].tolist(),
+            hits += p.rayTestBatch(
+                origins[part],
+                ends[part],
                 numThreads=1,
                 collisionFilterMask=STILL_GROUP,
                 physicsClientId=self.client,
             )
-            share[part], met[part] = [hit[2] for hit in hits], [names[hit[0]] for hit in hits]
-        return share, met
+        return hits
 
     def contacts(self) -> tuple[set[int], set[int]]:
         """Return the bodies that stand still, and the people, that the robot touches."""

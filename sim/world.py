@@ -190,16 +190,20 @@ class World:
         self.advance(linear, angular, seconds)
         return self.scan()
 
-    def advance(self, linear: float, angular: float, seconds: float = 0.1) -> None:
-        """Let people walk and the robot drive for a while."""
-        before = self.motion
-        base = before.world_from_base
+    def walk(self, seconds: float) -> None:
+        """Let people walk for a while; the robot stands where it was at the last step."""
+        base = self.motion.world_from_base
         robot = float(base[0, 3]), float(base[1, 3]), yaw(base)
         here = int(self.rooms_of(np.array([robot[:2]]))[0])
         with_robot = (self.rooms_of(self.crowd.position) == here) & (here >= 0)
         self.bodies_before = self.capsules
         self.crowd.advance(seconds, self.free, robot, with_robot)
         self.capsules = self._capsules()
+
+    def advance(self, linear: float, angular: float, seconds: float = 0.1) -> None:
+        """Let people walk and the robot drive for a while."""
+        base = self.motion.world_from_base
+        self.walk(seconds)
         self.physics.drive(linear, angular)
         self.trail = [base]
         touched: set[int] = set()
