@@ -32,14 +32,21 @@ class CodecError(ValueError):
     """A message that does not fit its type, or bytes that are no such message."""
 
 
+@functools.lru_cache(maxsize=1024)  # most arrays of a topic look alike
+def _array_head(dtype: np.dtype[Any], shape: tuple[int, ...]) -> tuple[bytes, np.dtype[Any]]:
+    """Return what stands before the bytes of an array, and the dtype that it travels with."""
+    if dtype.kind not in _ALLOWED_KINDS:
+        raise CodecError(f"arrays of dtype {dtype} cannot travel; use numbers or booleans")
+    little = dtype.newbyteorder("<")
+    head = msgspec.msgpack.encode((little.str, shape))
+    return bytes((len(head),)) + head, little
+
+
 def _array_pieces(value: Array) -> tuple[bytes, memoryview]:
     """Return the content of an array's extension: what it is, and its bytes as they lie in memory."""
-    if value.dtype.kind not in _ALLOWED_KINDS:
-        raise CodecError(f"arrays of dtype {value.dtype} cannot travel; use numbers or booleans")
-    little = value.dtype.newbyteorder("<")
-    contiguous = np.ascontiguousarray(value, dtype=little)
-    head = msgspec.msgpack.encode((little.str, value.shape))
-    return bytes((len(head),)) + head, contiguous.reshape(-1).view(np.uint8).data
+    head, little = _array_head(value.dtype, value.shape)
+    ready = value.flags.c_contiguous and value.dtype == little
+    return head, (value if ready else np.ascontiguousarray(value, little)).data
 
 
 def _pack_array(value: Any) -> Any:
@@ -68,16 +75,16 @@ def _encode(message: msgspec.Struct) -> bytes:
         return msgspec.msgpack.encode(message, enc_hook=_pack_array, order="deterministic")
     pieces: list[bytes | memoryview] = [between[0]]
     for (head, data), rest in zip(large, between[1:], strict=True):
-        pieces += (_EXT_32.pack(0xC9, len(head) + len(data), ARRAY_EXTENSION), head, data, rest)
+        pieces += (_EXT_32.pack(0xC9, len(head) + data.nbytes, ARRAY_EXTENSION), head, data, rest)
     return b"".join(pieces)
 
 
-_array_head = msgspec.msgpack.Decoder(tuple[str, tuple[int, ...]])
+_head_decoder = msgspec.msgpack.Decoder(tuple[str, tuple[int, ...]])
 
 
 @functools.lru_cache(maxsize=1024)  # most arrays of a topic look alike
 def _array_form(head: bytes) -> tuple[np.dtype[Any], tuple[int, ...]]:
-    name, shape = _array_head.decode(head)
+    name, shape = _head_decoder.decode(head)
     dtype = np.dtype(name)
     if dtype.kind not in _ALLOWED_KINDS:
         raise CodecError(f"arrays of dtype {dtype} cannot travel")
