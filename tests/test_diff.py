@@ -101,7 +101,7 @@ def test_fields_of_messages_are_named_and_all_that_differ() -> None:
         Pose(measured_at=0, world_from_base=np.eye(4)), Pose(measured_at=0, world_from_base=pose)
     )
     assert str(difference) == "world_from_base[2, 3] was 0.0, is 1e-09, largest difference 1e-09"
-    assert [str(item) for item in differences(old, "else")][0].startswith(" was Drive(")
+    assert next(differences(old, "else")).recorded.startswith("Drive(")
 
 
 def test_only_the_operator_that_differs_differs(record: Record) -> None:
