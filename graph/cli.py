@@ -27,7 +27,7 @@ DASHBOARD = "operators.dashboard"  # has attach(graph) -> graph, for `launch --v
 
 
 def _print_json(record: Any) -> None:
-    print(json.dumps(msgspec.to_builtins(record, enc_hook=str), indent=2))
+    print(msgspec.json.format(msgspec.json.encode(record, enc_hook=str), indent=2).decode())  # NaN becomes null
 
 
 def _changes(parser: argparse.ArgumentParser) -> None:
@@ -88,10 +88,12 @@ def _launch_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _launch(args: argparse.Namespace) -> int:
     from graph.check import check, require
+    from graph.info import describe
     from graph.inprocess import launch_in_process
     from graph.launcher import launch
     from graph.outcome import report, text
     from graph.playback import stand_in
+    from graph.recording import Recording
 
     graph = require(args.graph, args.set, args.swap)
     for warning in check(graph).warnings:
@@ -105,7 +107,10 @@ def _launch(args: argparse.Namespace) -> int:
     command = shlex.join(["retracer", *sys.argv[1:]])
     if args.in_process:
         verdict, path = launch_in_process(graph, record=args.record, command=command)
-        states: dict[str, Any] = {}
+        states: dict[str, Any] = {
+            item.operator: {"steps": item.steps, "p50_ms": item.p50_ms, "p95_ms": item.p95_ms, "skipped": item.skipped}
+            for item in describe(Recording(path)).operators
+        }
         wall = verdict.wall_seconds
     else:
         outcome = launch(
