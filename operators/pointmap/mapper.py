@@ -13,6 +13,8 @@ from operators.pointmap.occupancy import Occupancy
 from operators.pointmap.slam import PointMap, Settings, Track
 from operators.pointmap.voxel_map import MapPoints
 
+OCCUPANCY_EVERY = 3  # frames: at 10 Hz and 1 m/s the robot moves 0.3 m between them
+
 
 class Mapper:
     """A PointMap and an occupancy grid that grow together."""
@@ -40,7 +42,7 @@ class Mapper:
         """Align a frame (n, 3) in the sensor's frame and enter it, unless it is refused.
 
         world_from_base: (4, 4) the guess; the pose itself if it is `known`. level: the robot drives on one level floor
-        at height 0. Every other frame enters the grid, which takes heights from the ground of the frame, or from the
+        at height 0. Every third frame enters the grid, which takes heights from the ground of the frame, or from the
         floor under the base where the frame shows none.
         """
         frame = self.pointmap.prepare(points)
@@ -49,7 +51,7 @@ class Mapper:
             track = self.pointmap.enter(frame, guess)
         else:
             track = self.pointmap.track_frame(frame, guess, base_from_lidar if level else None)
-        if track.valid and len(frame.points) and self.pointmap.frames % 2 == 1:
+        if track.valid and len(frame.points) and self.pointmap.frames % OCCUPANCY_EVERY == 1:
             world, normals = frame.moved(track.world_from_lidar)
             ground = find_ground(world, normals)
             floor = (track.world_from_lidar @ inverse(base_from_lidar))[2, 3]
