@@ -24,7 +24,8 @@ WINDOW = 200  # calls over which the shown latency is taken
 @contextlib.contextmanager
 def progress_bar(text: str, *, quiet: bool = False) -> Iterator[Callable[[float], None]]:
     """Show a bar on stderr for a `with` block, which is given a function to call with the share that is done."""
-    with Progress(console=Console(stderr=True), disable=quiet, transient=True) as bar:
+    console = Console(stderr=True)
+    with Progress(console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
         task = bar.add_task(text, total=1.0)
         yield lambda share: bar.update(task, completed=share)
 
