@@ -34,10 +34,13 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     dropout: float = 0.0  # share lost at grazing incidence and far away, at most
 
 
-# hdl32e: Velodyne's data sheet; the noise is its typical accuracy, one sigma.
+# hdl32e: angles, columns at 10 Hz, range and its step are the data sheet's. The noise is a real sensor's: in a capture,
+# nine firings of one beam in a row scatter by 4.5 mm (median, 3 to 10 m away) about a smooth curve.
 PRESETS = {
     "paper": LidarSpec(),
-    "hdl32e": LidarSpec(columns=2170, lowest=-30.67, highest=10.67, nearest=0.9, farthest=70.0, noise=0.02, step=0.002),
+    "hdl32e": LidarSpec(
+        columns=2170, lowest=-30.67, highest=10.67, nearest=0.9, farthest=70.0, noise=0.005, step=0.002
+    ),
 }
 
 

@@ -21,6 +21,7 @@ from sim.clearance import clearance, length_of
 from sim.crowd import Crowd, spots, stature
 from sim.figure import figures, placed, radii, sitting
 from sim.furniture import SEAT_HEIGHT
+from sim.inspection import require
 from sim.layout import RESOLUTION, Seat, draw
 from sim.lidar import NOTHING, PRESETS, Hits, Lidar, LidarSpec, People
 from sim.odometry import Odometer, OdometryNoise
@@ -101,6 +102,7 @@ class World:
         changes = {"rolling": rolling, "dropout": dropout}
         self.spec = msgspec.structs.replace(lidar, **{name: v for name, v in changes.items() if v is not None})
         self.start = self.building.start_pose(tour)
+        require(self.building, [tour])
         self.targets = np.array(self.building.tours[tour].targets, np.float64).reshape(-1, 2)
         self.layout = draw(self.building, self.scenario, tour, seed)
         self.length = length_of(self.layout.way)  # metres, through all targets
