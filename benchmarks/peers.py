@@ -50,7 +50,7 @@ def zenoh_latencies(count: int, hertz: float) -> np.ndarray:
 
 
 def dora_latencies(count: int, hertz: float) -> np.ndarray:
-    """Send clouds from node to node of a dora dataflow. Returns (count,) in milliseconds. Raises if dora is not there."""
+    """Send clouds from node to node of a dora dataflow. Returns (count,) in milliseconds. Raises RuntimeError."""
     dora = shutil.which("dora", path=str(Path(sys.executable).parent))
     if dora is None:
         raise RuntimeError('dora is not installed: pip install "retracer[bench]"')
