@@ -15,8 +15,8 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """An architecture. Lengths in metres."""
 
     network: Literal["kpconv", "rangenet"] = "kpconv"
-    voxel: float = 0.06  # of the finest level, and of the cloud that is handed on
-    width: int = 64  # channels, see KPFCNN and RangeNet
+    voxel: float = 0.08  # of the finest level, and of the cloud that is handed on
+    width: int = 32  # channels, see KPFCNN and RangeNet
     levels: int = 5
     kernel_points: int = 15
     sphere: float = 4.0  # radius of a training sphere
@@ -32,6 +32,6 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 PRESETS = {
     "paper": Settings(voxel=0.04, width=128),
-    "realtime": Settings(voxel=0.08, width=64),
+    "realtime": Settings(voxel=0.08, width=32),
     "rangenet": Settings(network="rangenet", voxel=0.08, width=32),
 }
