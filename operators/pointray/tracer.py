@@ -1,0 +1,82 @@
+"""PointRay: which points of a map can move, by looking through them (paper section III-B)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from graph.geometry import Matrix, inverse, transform
+from operators.pointmap.angles import spherical
+from operators.pointmap.frame import separate
+from operators.pointmap.voxel_map import VoxelMap
+from operators.pointray.frustums import frustum_grid
+from operators.pointray.looks import FREE, LOOKS, STAMP, distinct_voxels, see_occupied, see_through
+
+Floats = npt.NDArray[np.float32]
+
+NEVER = -1
+UNKNOWN = 0.5  # movable probability of a point that was hardly looked at
+
+
+class RaySettings(NamedTuple):
+    """The size of the frustums and how many looks are enough."""
+
+    height: float = math.radians(1.33)  # the lidar's vertical resolution
+    width: float = math.radians(0.1)
+    least_looks: int = 10
+
+
+class PointRay:
+    """Count, for every point of a voxel map, how often frames looked at it and how often they saw through it.
+
+    Frames are added one by one, in any order; the map may grow between them. Only the map points within the reach of a
+    frame are touched.
+    """
+
+    def __init__(self, voxels: VoxelMap, settings: RaySettings | None = None) -> None:
+        self.voxels = voxels
+        self.settings = RaySettings() if settings is None else settings
+        self.frames = 0
+        self.counts = np.zeros((0, 4), np.int32)
+        self.touched = np.zeros(0, np.int64)  # scratch of `see_occupied`
+
+    def add(self, points: npt.NDArray[Any], world_from_lidar: Matrix) -> int:
+        """Take in one frame (n, 3) in the sensor's frame, at its pose. Returns how many map points were tried."""
+        self._grow()
+        x, y, z, _ = separate(np.ascontiguousarray(points, np.float32))
+        if not len(x) or not len(self.voxels):
+            return 0
+        rho, theta, phi = spherical(x, y, z)
+        frustums = frustum_grid(rho, theta, phi, self.settings.height, self.settings.width)
+        world = transform(world_from_lidar, np.stack([x, y, z], axis=1).astype(np.float64))
+        size, store = self.voxels.voxel_size, self.voxels.store
+        if len(self.touched) != len(store.table):
+            self.touched = np.zeros(len(store.table), np.int64)
+        see_occupied(store, self.counts, distinct_voxels(world, size), self.touched, self.frames)
+        box = np.stack([world.min(axis=0), world.max(axis=0)])
+        tried = see_through(store, self.counts, frustums, inverse(world_from_lidar), box, size, self.frames)
+        self.frames += 1
+        return int(tried)
+
+    def looks(self) -> npt.NDArray[np.int32]:
+        """Return how often each point of the map was looked at (n,)."""
+        self._grow()
+        return self.counts[: len(self.voxels), LOOKS].copy()
+
+    def movable(self) -> Floats:
+        """Return the movable probability of each point of the map (n,): 0.5 where fewer than `least_looks` looked."""
+        self._grow()
+        counts = self.counts[: len(self.voxels)]
+        enough = counts[:, LOOKS] >= self.settings.least_looks
+        share = counts[:, FREE] / np.maximum(1, counts[:, LOOKS])
+        return np.where(enough, share, UNKNOWN).astype(np.float32)
+
+    def _grow(self) -> None:
+        if len(self.counts) < len(self.voxels):
+            larger = np.zeros((max(len(self.voxels), 2 * len(self.counts)), 4), np.int32)
+            larger[:, STAMP] = NEVER
+            larger[: len(self.counts)] = self.counts
+            self.counts = larger
