@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
@@ -76,7 +77,8 @@ def _rooms(axes: Axes, building: Building) -> None:
 
 
 def _walls(axes: Axes, building: Building) -> None:
-    standing, hanging = [], []
+    standing: list[npt.NDArray[np.float64]] = []
+    hanging: list[npt.NDArray[np.float64]] = []
     for body in wall_bodies(building):
         for part in body.parts:
             (standing if part.z - part.dz / 2 < 0.5 else hanging).append(part.footprint())
