@@ -45,7 +45,7 @@ def draw_plan(building: Building, path: Path, *, only: str | None = None) -> Non
     axes.set_title(_title(building))
     if names:
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.04), ncols=4, frameon=False)
-    figure.savefig(path, dpi=100)
+    figure.savefig(path, dpi=100, bbox_inches="tight")
 
 
 def _title(building: Building) -> str:
