@@ -64,36 +64,42 @@ class ShardReader:
 
 
 def leave_out(readers: Sequence[ShardReader]) -> list[str]:
-    """Cut from shards of lockstep the last calls whose messages were never written; return sentences that say so.
+    """Cut from shards the last calls whose messages were never written; return sentences that say so.
 
     An operator puts its messages before it writes them. One that is killed in between leaves the others with calls
     that no replay could repeat.
     """
     steps: dict[ShardReader, list[Step]] = {reader: [] for reader in readers}
-    there: set[tuple[str, int]] = set()  # topic, sequence
+    there: set[tuple[str, int, int]] = set()  # topic, incarnation, sequence
+    owners: dict[ShardReader, tuple[str, int]] = {}
+
+    def said(reader: ShardReader, calls: Sequence[Step]) -> set[tuple[str, int, int]]:
+        name, incarnation = owners[reader]
+        return {(f"{name}/{item.port}", incarnation, item.sequence) for step in calls for item in step.emitted}
+
     for reader in readers:
         for entry in reader.entries():
+            owners[reader] = (entry.operator, entry.incarnation)
             if entry.port == STEP:
                 steps[reader].append(entry.step())
-                there.update((f"{entry.operator}/{item.port}", item.sequence) for item in steps[reader][-1].emitted)
             elif entry.port != SUMMARY:
-                there.add((entry.topic, entry.sequence))
+                there.add((entry.topic, entry.incarnation, entry.sequence))
+        there |= said(reader, steps[reader]) if steps[reader] else set()
     again = True
     while again:
         again = False
         for reader, own in steps.items():
             for place, step in enumerate(own):
-                if all(ref.topic.startswith("timer/") or (ref.topic, ref.sequence) in there for ref in step.consumed):
+                wanted = [ref for ref in step.consumed if not ref.topic.startswith("timer/")]
+                if all((ref.topic, ref.incarnation, ref.sequence) in there for ref in wanted):
                     continue
                 reader.cut = step.index
-                name = reader.path.name.partition(".")[0]
-                there -= {(f"{name}/{item.port}", item.sequence) for late in own[place:] for item in late.emitted}
+                there -= said(reader, own[place:])
                 del own[place:]
                 again = True
                 break
     return [
-        f"calls of {reader.path.name.partition('.')[0]} from number {reader.cut} on are left out: what they consumed"
-        " was never written"
+        f"calls of {owners[reader][0]} from number {reader.cut} on are left out: what they consumed was never written"
         for reader in readers
         if reader.cut < INFINITY
     ]
@@ -171,7 +177,7 @@ def merge(
     """
     by_name = {spec.name: spec for spec in run.specs}
     readers = [ShardReader(path) for path in shards]
-    if crashed and all(spec.mode == "lockstep" for spec in run.specs):
+    if crashed:
         reasons = [*reasons, *leave_out(readers)]
     part = out.with_name(out.name + ".part")
     ledger = Ledger(by_name)

@@ -194,11 +194,11 @@ class _Run:
                     busy = True
         for item in self.retraced.values():
             for _, step in item.waiting:
-                missing: Ref = next(ref for ref in step.consumed if self._missing(ref))
                 item.report.unjudged += 1
                 item.broken = True
-                what = f"{missing.topic} number {missing.sequence}, which it consumed, is not in the recording"
-                item.report.first = item.report.first or Divergence(step.index, step.stamp, step.port, what, [])
+                for missing in filter(self._missing, step.consumed):
+                    what = f"{missing.topic} number {missing.sequence}, which it consumed, is not in the recording"
+                    item.report.first = item.report.first or Divergence(step.index, step.stamp, step.port, what, [])
             item.waiting.clear()
 
     def _missing(self, ref: Ref) -> bool:

@@ -154,7 +154,12 @@ class Worker:
         """Put a message on the wire, and remember it for the shard.
 
         In lockstep nobody may handle it before this call's mark has come, so it waits for that and they travel as one.
+        Where the run goes on after this process was killed, the shard comes first: else nobody could replay the others.
         """
+        if self.lockstep is None and self.spec.restart == "on-failure":
+            self.shard.leave([emission])
+            self._put(emission)
+            return
         if self.lockstep is None:
             self._put(emission)
         self.emissions.append(emission)
