@@ -1,14 +1,16 @@
-"""Operators that put the runtime on trial: of many ports, sporadic, quitting, hoarding, waiting."""
+"""Operators that put the runtime on trial: of many ports, sporadic, failing, leaving, with words at the end."""
 
 from __future__ import annotations
 
+import os
+import subprocess
 from collections.abc import Iterator
 
 import msgspec
 
 from graph import End, Operator, Sink, Source
 from graph.messages import Tick
-from tests.sample_operators import Count
+from tests.sample_operators import Count, CountOutputs, Relay
 
 MODULUS = 1_000_003
 
@@ -112,3 +114,43 @@ class Stumbling(Sink):
 
     def on_count(self, count: Count) -> None:
         raise RuntimeError("a sink that stumbles")
+
+
+class Parent(Relay):
+    """Start a process that outlives it, and say its number."""
+
+    def on_start(self) -> None:
+        self.child = subprocess.Popen(["sleep", "600"])
+
+    def on_count(self, count: Count) -> CountOutputs:
+        return CountOutputs(Count(measured_at=count.measured_at, value=self.child.pid))
+
+
+class Leaving(Relay):
+    """Leave the process at the fifth number, as if nothing were wrong."""
+
+    def on_count(self, count: Count) -> CountOutputs:
+        if count.value == 5:
+            os._exit(0)
+        return super().on_count(count)
+
+
+class Stuttering(Relay):
+    """Say each number twice, and fail between the two at `at`."""
+
+    class Config(msgspec.Struct):
+        at: int = 5
+        offset: int = 0
+
+    def on_count(self, count: Count) -> Iterator[CountOutputs]:
+        yield super().on_count(count)
+        if count.value == self.config.at:
+            raise RuntimeError("stuttered")
+        yield super().on_count(count)
+
+
+class LastWords(Relay):
+    """Say one more number at the end."""
+
+    def on_end(self) -> CountOutputs:
+        return CountOutputs(Count(measured_at=0, value=-1))
