@@ -239,7 +239,7 @@ def test_realtime_under_load_accounts_for_every_message_and_replays(graph_file: 
 
 def test_realtime_brings_a_failed_operator_back(graph_file: Write, tmp_path: Path) -> None:
     text = """
-clock: {mode: realtime, duration: 6s}
+clock: {mode: realtime}
 operators:
   counter: {run: tests.sample_operators:Counter, inputs: {tick: timer/50hz}}
   relay: {run: tests.sample_operators:Relay, inputs: {count: counter/count}, restart: on-failure}
@@ -249,6 +249,10 @@ operators:
     children = under_way(process, tmp_path / "run.shards", 3, 10_000)
     relay = next(item for item in children if (tmp_path / "run.shards" / "relay.0.mcap") in _files(item))
     relay.kill()
+    returned, until = tmp_path / "run.shards" / "relay.1.mcap", time.monotonic() + LIMIT
+    while not (returned.exists() and returned.stat().st_size > 5000) and time.monotonic() < until:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=LIMIT)
     assert "relay was ended by signal 9 (SIGKILL); starting it again" in err
     recording = Recording(tmp_path / "run.mcap")
