@@ -49,8 +49,9 @@ def draw(building: Building, scenario: Scenario, tour: str, seed: int) -> Layout
     """Draw one session's layout. Raises BuildingError if a target of the tour cannot be reached."""
     rng = np.random.default_rng([seed, 1])
     bounds = building.bounds()
-    way = tour_way(building, tour)
-    bodies = [*wall_bodies(building), *_leaves(building, way, rng)]
+    leaves = _leaves(building, tour_way(building, tour), rng)
+    way = tour_way(building, tour, leaves)  # around the leaves that stand open
+    bodies = [*wall_bodies(building), *leaves]
     targets = np.array([building.start_pose(tour)[:2], *building.tours[tour].targets])
     site = _Site(clearance(bodies, bounds, RESOLUTION), way, targets)
     seats: list[Seat] = []
@@ -67,12 +68,14 @@ def draw(building: Building, scenario: Scenario, tour: str, seed: int) -> Layout
     return Layout(bodies, seats, clearance(bodies, bounds, RESOLUTION), way)
 
 
-def tour_way(building: Building, tour: str) -> Array:
+def tour_way(building: Building, tour: str, leaves: list[Body] | None = None) -> Array:
     """Find the way (n, 2) of the robot from the start through all targets, past the tables' places where it can.
 
-    Raises BuildingError by tour and target where the empty building has no way.
+    leaves: the doors as they stand; absent: all open but those whose angle is fixed. Raises BuildingError by tour and
+    target where the empty building has no way.
     """
-    shell, bounds = wall_bodies(building) + fixed_leaves(building), building.bounds()
+    shell = wall_bodies(building) + (fixed_leaves(building) if leaves is None else leaves)
+    bounds = building.bounds()
     empty = clearance(shell, bounds, RESOLUTION)
     furnished = clearance(shell + _reserved(building), bounds, RESOLUTION)
     at = building.start_pose(tour)[:2]

@@ -30,6 +30,7 @@ TILT = -0.22  # radians, of the eye-level view
 SIZE = (1600, 900)  # rays of the eye-level view
 ABOVE = 2800  # rays across the view from above
 RADIUS = 9.0  # metres of the lidar frame that are shown from above
+DPI = 90
 BACKDROP = "#15181d"
 FRAME_COLOURS = np.where(np.arange(len(PALETTE))[:, None] == Truth.GROUND, np.float32(0.42), PALETTE)
 
@@ -142,7 +143,7 @@ def _sheet(
     middle.set(title=f"one lidar frame of {len(points)} points in the same view, coloured by truth")
     _from_above(lower, points, frame.truth, pose)
     lower.set(title="the same frame from above, around the robot (m)")
-    figure.savefig(path, dpi=90)
+    figure.savefig(path, dpi=DPI)
 
 
 def _in_view(axes: Axes, camera: Camera, points: Array, truth: npt.NDArray[np.uint8], spot: Spot) -> None:
