@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from numba import njit
 
 from graph.contract import ports_of
 from graph.geometry import inverse, planar, transform
@@ -41,6 +42,23 @@ def two_rooms(door=(3.6, 4.5)):
 ROOM = two_rooms()[:4]
 
 
+@njit(cache=True)
+def cast(rays, origin, boxes):
+    """Return the distance along each ray (n, 3) to the floor or the nearest box (b, 6)."""
+    reach = np.empty(len(rays))
+    for i in range(len(rays)):
+        reach[i] = -origin[2] / rays[i, 2] if rays[i, 2] < 0.0 else np.inf
+        for j in range(len(boxes)):
+            enter, leave = 0.0, reach[i]
+            for axis in range(3):
+                slope = rays[i, axis] if abs(rays[i, axis]) > 1e-12 else 1e-12
+                a, b = (boxes[j, axis] - origin[axis]) / slope, (boxes[j, axis + 3] - origin[axis]) / slope
+                enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
+            if 0.0 < enter <= leave:
+                reach[i] = enter
+    return reach
+
+
 class Building:
     """Boxes (x0, y0, z0, x1, y1, z1) and a robot among them."""
 
@@ -54,17 +72,9 @@ class Building:
         """Cast the rays at the boxes and the floor; nothing nearer than 0.9 m echoes."""
         yaw = self.pose[2]
         turn = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1.0]])
-        rays = RAYS @ turn.T
-        origin = np.array([self.pose[0], self.pose[1], LIDAR_HEIGHT])
-        nearest = np.where(rays[:, 2] < 0, -LIDAR_HEIGHT / np.minimum(rays[:, 2], -1e-9), np.inf)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            for box in self.boxes:
-                near = (box[:3] - origin) / rays
-                far = (box[3:] - origin) / rays
-                enter, leave = np.minimum(near, far).max(axis=1), np.maximum(near, far).min(axis=1)
-                nearest = np.where((enter <= leave) & (enter > 0), np.minimum(nearest, enter), nearest)
-        seen = (nearest > 0.9) & (nearest < 30.0)
-        return (RAYS[seen] * nearest[seen, None]).astype(np.float32)
+        reach = cast(RAYS @ turn.T, np.array([self.pose[0], self.pose[1], LIDAR_HEIGHT]), self.boxes)
+        seen = (reach > 0.9) & (reach < 30.0)
+        return (RAYS[seen] * reach[seen, None]).astype(np.float32)
 
     def move(self, linear, angular):
         for _ in range(10):
@@ -134,6 +144,7 @@ def drive_limits_hold(tour):
         drives[:, 0].max() <= config.max_speed
         and drives[:, 0].min() >= -config.max_reverse
         and np.abs(drives[:, 1]).max() <= config.max_turn
+        and change[0] <= config.acceleration * 0.1 + 1e-9
         and change[1] <= config.turn_acceleration * 0.1 + 1e-9
     )
 

@@ -42,6 +42,11 @@ class Commands:
         """Note a command that answers a measurement (nanoseconds)."""
         self._given.append((measured_at + round(self.latency * 1e9), command))
 
+    @property
+    def latest(self) -> Twist:
+        """Return the last command given; at rest before the first."""
+        return self._given[-1][1] if self._given else Twist()
+
     def at(self, time: int) -> Twist:
         """Return the command in effect at a time in nanoseconds; at rest before the first."""
         effective = Twist()

@@ -31,6 +31,9 @@ REST = 200  # periods after which an unreachable target is tried again
 CAREFUL_SPEED = 0.4  # m/s at most, while the localizer is not sure
 
 
+Planar = tuple[float, float, float]  # x, y in metres, yaw in radians
+
+
 class Decision(NamedTuple):
     """What to do now, and why."""
 
@@ -89,7 +92,7 @@ class Navigator:
         self._started = False
         self._until_replan = 0
         self._without_way = 0
-        self._trail: deque[tuple[float, float, float]] = deque(maxlen=STILL_FOR)
+        self._trail: deque[Planar] = deque(maxlen=STILL_FOR)
         self._recovery: Recovery | None = None
         self._attempts = 0
         self._attempt_place = (0.0, 0.0)
@@ -115,38 +118,57 @@ class Navigator:
     def step(self, measured_at: int, world_from_base: Matrix, *, valid: bool = True) -> Decision:
         """Decide what to do from a pose measured at a time in nanoseconds; drive carefully when it is not valid."""
         measured = float(world_from_base[0, 3]), float(world_from_base[1, 3]), yaw(world_from_base)
-        if self._goal is None:
-            return self._decide(measured_at, Twist(), measured, "wait")
         pose = self.commands.predict(measured_at, *measured)
+        wanted, status, trajectory = self._choose(measured, pose, self.limits.speed if valid else CAREFUL_SPEED)
+        now, limits = self.commands.latest, self.limits
+        twist = Twist(
+            towards(now.linear, wanted.linear, limits.acceleration * STEP),
+            towards(now.angular, wanted.angular, limits.turn_acceleration * STEP),
+        )
+        self.commands.give(measured_at, twist)
+        path = self._path if status in ("follow", "recover") else self._path[:0]
+        return Decision(twist, path, np.array([pose]) if trajectory is None else trajectory, status)
+
+    def _choose(
+        self, measured: Planar, pose: Planar, top_speed: float
+    ) -> tuple[Twist, str, npt.NDArray[np.float64] | None]:
+        """Return the velocities to come to, the status and the trajectory; `pose` is `measured`, carried on to now."""
+        if self._goal is None:
+            return Twist(), "wait", None
         self.costmap.cover(pose[:2], self._goal)
         if not self._started:  # whoever put the robot down left it room to turn
             self._started = True
             self.costmap.trust(pose[0], pose[1], self.footprint.circumscribed + 2.0 * self.window.padding)
         self.costmap.clear_footprint(self.footprint, measured)
-        if math.dist(pose[:2], self._goal) < ARRIVED:
+        left = math.dist(pose[:2], self._goal)
+        if left < ARRIVED:
             self._trail.clear()
-            return self._decide(measured_at, Twist(), pose, "arrived")
+            return Twist(), "arrived", None
         if self._given_up > 0:
             self._given_up -= 1
-            self._until_replan = 0
-            return self._decide(measured_at, Twist(), pose, "unreachable")
+            return Twist(), "unreachable", None
         if self._until_replan == 0:
             self._search(pose)
         self._until_replan -= 1
         if self._without_way > PATIENCE:
-            return self._decide(measured_at, Twist(), pose, "unreachable")
+            return Twist(), "unreachable", None
         if math.dist(pose[:2], self._attempt_place) > FRESH:
-            self._attempts, self._attempt_place = 0, (pose[0], pose[1])
+            self._attempts, self._attempt_place = 0, pose[:2]
         around = self.costmap.window(pose[0], pose[1], self._side, self._side / 4.0)
         if self._recovery is None and self._stuck(pose):
             self._recover(pose)
         if self._recovery is not None:
             twist = self._get_loose(pose, around)
             if twist is not None:
-                return self._decide(measured_at, twist, pose, "recover")
-        return self._follow(measured_at, pose, around, self.limits.speed if valid else CAREFUL_SPEED)
+                return twist, "recover", None
+        assert self._field is not None
+        seconds_per_cost = self._field_lattice.resolution / (FREE * UNIT) / self.limits.speed
+        way = way_around(self._field, self._field_lattice, pose[0], pose[1], self._side, seconds_per_cost)
+        top_speed = min(top_speed, math.sqrt(2.0 * self.limits.acceleration * left))  # so as to stop at the goal
+        choice = self.window.choose(pose, self.commands.latest, around, way, top_speed=top_speed)
+        return choice.target, "follow", choice.trajectory
 
-    def _search(self, pose: tuple[float, float, float]) -> None:
+    def _search(self, pose: Planar) -> None:
         """Search from the goal; when what was seen leaves no way, by the map alone: people move on, and doors open."""
         assert self._goal is not None
         self._until_replan = REPLAN
@@ -181,7 +203,7 @@ class Navigator:
         flat = (rows * lattice.columns + columns)[fit]
         return flat, np.round(away[fit] * NEARBY_COST * per_metre).astype(np.int32)
 
-    def _stuck(self, pose: tuple[float, float, float]) -> bool:
+    def _stuck(self, pose: Planar) -> bool:
         """Say whether the robot has hardly moved for STILL_FOR periods."""
         self._trail.append(pose)
         if len(self._trail) < STILL_FOR:
@@ -190,20 +212,20 @@ class Navigator:
         away = np.hypot(trail[:, 0] - pose[0], trail[:, 1] - pose[1]).max()
         return bool(away < STILL and np.abs(wrap(trail[:, 2] - pose[2])).max() < STILL_TURN)
 
-    def _recover(self, pose: tuple[float, float, float]) -> None:
+    def _recover(self, pose: Planar) -> None:
         """Start getting loose, or give up for a while after too many attempts in one place.
 
         What the robot stood before and could not see, it takes for an obstacle from now on, until a ray passes there.
         """
         self.costmap.distrust(pose[0], pose[1])
         if self._attempts == ATTEMPTS:
-            self._attempts, self._given_up = 0, REST
+            self._attempts, self._given_up, self._until_replan = 0, REST, 0
         ahead = self._path[min(6, len(self._path) - 1)] if len(self._path) else np.array(self._goal)
         turn = float(wrap(math.atan2(ahead[1] - pose[1], ahead[0] - pose[0]) - pose[2]))
         self._recovery = Recovery(self._attempts, turn, self.limits)
         self._attempts += 1
 
-    def _get_loose(self, pose: tuple[float, float, float], around: Surroundings) -> Twist | None:
+    def _get_loose(self, pose: Planar, around: Surroundings) -> Twist | None:
         """Return the present motion of the recovery, or None when it is over."""
         assert self._recovery is not None
         motions = self._recovery.motions
@@ -216,32 +238,3 @@ class Navigator:
         self._until_replan = 0
         self._trail.clear()
         return None
-
-    def _follow(
-        self, measured_at: int, pose: tuple[float, float, float], around: Surroundings, top_speed: float
-    ) -> Decision:
-        """Let the dynamic window choose, and come nearer to its choice as fast as the drive can."""
-        assert self._field is not None
-        limits = self.limits
-        now = self.commands.at(measured_at + round(self.commands.latency * 1e9))
-        seconds_per_cost = self._field_lattice.resolution / (FREE * UNIT) / limits.speed
-        way = way_around(self._field, self._field_lattice, pose[0], pose[1], self._side, seconds_per_cost)
-        choice = self.window.choose(pose, now, around, way, top_speed=top_speed)
-        twist = Twist(
-            towards(now.linear, choice.target.linear, limits.acceleration * STEP),
-            towards(now.angular, choice.target.angular, limits.turn_acceleration * STEP),
-        )
-        return self._decide(measured_at, twist, pose, "follow", choice.trajectory)
-
-    def _decide(
-        self,
-        measured_at: int,
-        twist: Twist,
-        pose: tuple[float, float, float],
-        status: str,
-        trajectory: npt.NDArray[np.float64] | None = None,
-    ) -> Decision:
-        if status not in ("follow", "recover"):
-            self._path = self._path[:0]
-        self.commands.give(measured_at, twist)
-        return Decision(twist, self._path, np.array([pose]) if trajectory is None else trajectory, status)
