@@ -57,11 +57,12 @@ def test_the_marker_holds_a_recording_against_its_text(
     )
     pytester.makeini("[pytest]\naddopts = -p graph.testing")
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    missing = pytester.runpytest_subprocess()
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
+    missing = pytester.runpytest_inprocess()
     missing.stdout.fnmatch_lines(["*run.txt is missing; pytest --update-references writes it*"])
-    assert pytester.runpytest_subprocess("--update-references").ret == 0
-    assert pytester.runpytest_subprocess().ret == 0
+    assert pytester.runpytest_inprocess("--update-references").ret == 0
+    assert pytester.runpytest_inprocess().ret == 0
     text = Path(pytester.path / "run.txt")
     text.write_text(text.read_text().replace("30 messages", "31 messages"))
-    changed = pytester.runpytest_subprocess()
+    changed = pytester.runpytest_inprocess()
     changed.stdout.fnmatch_lines(["*run.txt says something else*"])
