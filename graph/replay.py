@@ -227,8 +227,7 @@ class _Run:
             item.broken = True
             place = traceback.extract_tb(error.__traceback__)[-1]
             what = f"it raised {type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})"
-            report.divergent += 1
-            report.first = report.first or Divergence(step.index, step.stamp, step.port, what, [])
+            report.diverge(Divergence(step.index, step.stamp, step.port, what, []))
             return
         report.seconds += time.perf_counter() - begin
         for ref in (*step.consumed, *(Ref(*msgspec.structs.astuple(skip)[:3]) for skip in step.skipped)):
@@ -239,8 +238,7 @@ class _Run:
         if item.tainted:
             report.unjudged += 1
         elif divergence is not None:
-            report.divergent += 1
-            report.first = report.first or divergence
+            report.diverge(divergence)
         self._pass_on(item, incarnation, step, emissions, said)
         if self.keep is not None:
             self.keep(item.spec.name, incarnation, emissions, done, node.summary)

@@ -26,6 +26,12 @@ class Divergence(msgspec.Struct):
         detail = "; ".join(map(str, self.fields)) or self.what
         return f"step {self.step} at {self.stamp / 1e9:.3f} s, {self.port}: {detail}"
 
+    @property
+    def largest(self) -> float:
+        """Return the largest difference; infinity where something else than a number differs."""
+        gaps = [field.largest for field in self.fields]
+        return max((math.inf if gap is None else gap for gap in gaps), default=math.inf)
+
 
 class OperatorReplay(msgspec.Struct):
     """What came of replaying one operator."""
@@ -36,6 +42,7 @@ class OperatorReplay(msgspec.Struct):
     divergent: int = 0  # steps that said something else
     unjudged: int = 0  # steps fed with what had diverged upstream and is recorded as digest only
     first: Divergence | None = None
+    largest: float = 0.0  # difference in any step; infinite where more than numbers differ
     seconds: float = 0.0  # of computing
     times_real_time: float = 0.0
     swapped: bool = False
@@ -44,6 +51,12 @@ class OperatorReplay(msgspec.Struct):
     @property
     def equal(self) -> bool:
         return self.first is None and self.unjudged == 0
+
+    def diverge(self, divergence: Divergence) -> None:
+        """Note a step that said something else."""
+        self.divergent += 1
+        self.first = self.first or divergence
+        self.largest = max(self.largest, divergence.largest)
 
 
 class Replay(msgspec.Struct):
