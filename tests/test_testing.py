@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from graph.override import override
 from graph.recording import Recording
-from graph.testing import reference, run_operator
+from graph.replay import replay
+from graph.testing import reference, run_operator, tolerable
 from tests.conftest import ROOT
 from tests.sample_operators import Adder, Count, Failing, Relay
 
@@ -53,16 +55,39 @@ def test_the_marker_holds_a_recording_against_its_text(
         @pytest.mark.replay("run.mcap")
         def test_run(replayed):
             assert replayed.equal
+
+        @pytest.mark.replay("run.mcap")
+        def test_without_the_fixture(): ...
+
+        @pytest.mark.replay("none.mcap")
+        def test_nothing(): ...
         """
     )
     pytester.makeini("[pytest]\naddopts = -p graph.testing")
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
     missing = pytester.runpytest_inprocess()
+    missing.assert_outcomes(errors=3)
     missing.stdout.fnmatch_lines(["*run.txt is missing; pytest --update-references writes it*"])
-    assert pytester.runpytest_inprocess("--update-references").ret == 0
-    assert pytester.runpytest_inprocess().ret == 0
+    missing.stdout.fnmatch_lines(["*none.mcap: no such recording"])
+    pytester.runpytest_inprocess("--update-references").assert_outcomes(passed=2, errors=1)
+    pytester.runpytest_inprocess().assert_outcomes(passed=2, errors=1)
     text = Path(pytester.path / "run.txt")
     text.write_text(text.read_text().replace("30 messages", "31 messages"))
     changed = pytester.runpytest_inprocess()
     changed.stdout.fnmatch_lines(["*run.txt says something else*"])
+
+
+def test_elsewhere_every_step_must_lie_within_the_tolerance(record: Record) -> None:
+    recording = record()
+    near, far = (override(recording.graph, [f"adder.scale={scale}"], []) for scale in (1.000001, 1.1))
+    report = replay(recording, graph=near, changed=["adder"])
+    (adder,) = report.operators
+    assert adder.first is not None
+    assert 0.0 < adder.first.largest < adder.largest < 1e-3  # the sums grow
+    assert not tolerable(report)  # here bits count
+    report.warnings.append("recorded on another class of processor")
+    assert tolerable(report)
+    report = replay(recording, graph=far, changed=["adder"])
+    report.warnings.append("recorded on another class of processor")
+    assert not tolerable(report)
