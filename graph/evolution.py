@@ -61,5 +61,9 @@ def require_schema(recording: Recording, topic: str, kind: type[Any]) -> None:
     name, text = recording.types[topic]
     if name != type_name(kind):
         raise RecordingError(f"{recording.path}: {topic} holds {name}; {type_name(kind)} is wanted")
-    if (reason := mismatch(text, schema(kind))) is not None:
+    try:
+        reason = mismatch(text, schema(kind))
+    except (ValueError, AttributeError, TypeError) as error:
+        raise RecordingError(f"{recording.path}: the schema of {topic} cannot be read: {error}") from error
+    if reason is not None:
         raise RecordingError(f"{recording.path}: {topic} is of another version of {kind.__name__}: {reason}")

@@ -66,8 +66,11 @@ class Entry(NamedTuple):
         return f"{self.operator}/{self.port}"
 
     def step(self) -> Step:
-        """Decode a ledger entry."""
-        return _step_decoder.decode(self.payload)
+        """Decode a ledger entry. Raises RecordingError if it is none."""
+        try:
+            return _step_decoder.decode(self.payload)
+        except msgspec.MsgspecError as error:
+            raise RecordingError(f"{self.topic} number {self.sequence} is no step of a ledger: {error}") from error
 
 
 class Run(msgspec.Struct):
@@ -218,6 +221,7 @@ class Recording:
             self.verdict: Verdict = unseal(self.metadata[VERDICT], Verdict, VERDICT)
         except RecordingError as error:
             raise RecordingError(f"{self.path}: {error}") from None
+        self.require_ledger()
 
     def _read_index(self, stream: IO[bytes], size: int) -> None:
         """Read what is where, and the metadata, by the summary section, whose CRC must be right."""
