@@ -105,6 +105,27 @@ def test_the_sheet_shows_the_session(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert 0.0 < told[0] < told[-1] <= 1.0
 
 
+def test_a_world_of_boxes_is_driven_and_scanned(tmp_path: Path) -> None:
+    """A building of boxes, without a single wall line; its doorway has no door."""
+    (tmp_path / "walls.ply").write_text(
+        "ply\nformat ascii 1.0\nelement box 6\n"
+        + "".join(f"property float {end}_{axis}\n" for end in ("min", "max") for axis in "xyz")
+        + "end_header\n0 0 0 10 .2 2.5\n0 5.8 0 10 6 2.5\n0 0 0 .2 6 2.5\n9.8 0 0 10 6 2.5\n"
+        "4.9 0 0 5.1 2 2.5\n4.9 3.2 0 5.1 6 2.5\n"
+    )
+    (tmp_path / "flat.yaml").write_text(
+        "boxes: walls.ply\nstart: [1, 2.6, 0]\ntables: [{at: [8, 4.4], models: [cafe]}]\n"
+        "rooms: [{name: west, rectangle: [0, 0, 5, 6], populated: true}, {name: east, rectangle: [5, 0, 10, 6]}]\n"
+        "tours: {A: {targets: [[8.5, 2.6]]}}\n"
+    )
+    world = World(tmp_path / "flat.yaml", "extreme", "A", 1)
+    assert len(world.crowd.position) > 3
+    frame = world.step(0.5, 0.0)
+    assert {Truth.GROUND, Truth.WALL} <= set(np.unique(frame.truth).tolist())
+    seen = {world.bodies[body].name for body in np.unique(frame.instance) if body < len(world.bodies)}
+    assert {"block 2", "block 4", "block 5"} <= seen
+
+
 def test_the_robot_is_put_where_it_is_seen_and_touches_nobody() -> None:
     world = World("annex", "hard", "A", 2)
     spot = snapshot.liveliest(world)
