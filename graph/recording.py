@@ -86,6 +86,12 @@ class Run(msgspec.Struct):
     format: int = FORMAT
 
 
+class _Format(msgspec.Struct):
+    """What any version of a metadata record can be asked for."""
+
+    format: int = FORMAT
+
+
 class EdgeAccount(msgspec.Struct):
     """emitted * ports = consumed + skipped + later + lost, on the edge from a topic to an operator."""
 
@@ -151,12 +157,12 @@ def unseal(metadata: dict[str, str], kind: type[Any], name: str) -> Any:
     text = metadata.get("json", "").encode()
     if metadata.get("digest") != digest(text).hex():
         raise RecordingError(f"its {name} record is damaged: the digest does not fit")
-    version = msgspec.json.decode(text).get("format", FORMAT)
-    if version != FORMAT:
-        raise RecordingError(f"it is of recording format {version}; this version of retracer reads format {FORMAT}")
     try:
+        version = msgspec.json.decode(text, type=_Format).format
+        if version != FORMAT:
+            raise RecordingError(f"it is of recording format {version}; this version of retracer reads format {FORMAT}")
         return msgspec.json.decode(text, type=kind)
-    except msgspec.ValidationError as error:
+    except msgspec.MsgspecError as error:
         raise RecordingError(f"its {name} record does not fit this version of retracer: {error}") from error
 
 
