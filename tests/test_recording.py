@@ -8,6 +8,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from graph.codec import digest
@@ -15,8 +16,9 @@ from graph.diff import compare
 from graph.errors import UserError
 from graph.info import describe, text
 from graph.ledger import Step
-from graph.recording import RUN, Recording, RecordingError
+from graph.recording import RUN, VERDICT, Recording, RecordingError
 from graph.replay import replay
+from graph.replay_report import lines
 
 Record = Callable[..., Recording]
 
@@ -162,6 +164,66 @@ def test_the_sentence_says_what_is_wrong(record: Record, tmp_path: Path, kind: s
     with pytest.raises(UserError) as raised:
         read_all(path)
     assert words in str(raised.value)
+
+
+def _remade(recording: Recording, path: Path, change: Callable[[str, bytes], bytes]) -> Path:
+    """Write a whole recording again, sound to the last checksum, with other content."""
+    with recording.path.open("rb") as stream, path.open("wb") as out:
+        reader, writer = make_reader(stream), Writer(out)
+        writer.start("retracer")
+        summary = reader.get_summary()
+        assert summary is not None
+        for item in summary.schemas.values():
+            writer.register_schema(item.name, item.encoding, change(f"schema {item.name}", item.data))
+        for item in summary.channels.values():
+            writer.register_channel(item.topic, item.message_encoding, item.schema_id, item.metadata)
+        for _, channel, message in reader.iter_messages():
+            data = change(channel.topic, message.data)
+            writer.add_message(message.channel_id, message.log_time, data, message.publish_time, message.sequence)
+        for name, struct in ((RUN, recording.run), (VERDICT, recording.verdict)):
+            told = change(name, msgspec.json.encode(struct))
+            writer.add_metadata(name, {"json": told.decode(), "digest": digest(told).hex()})
+        writer.finish()
+    return path
+
+
+def test_a_recording_that_is_written_again_reads_the_same(record: Record, tmp_path: Path) -> None:
+    recording = record()
+    path = _remade(recording, tmp_path / "again.mcap", lambda name, data: data)
+    assert compare(recording, Recording(path)).equal
+    assert replay(Recording(path)).equal
+
+
+@pytest.mark.parametrize(
+    ("where", "old", "new", "words"),
+    [
+        (RUN, b'"cpu":', b'"processor":', "does not fit this version of retracer: Object missing required field `cpu`"),
+        (RUN, b'"specs":[', b'"specs":[3,', "does not fit this version of retracer: Expected `object`, got `int`"),
+        (
+            VERDICT,
+            b'"accounts":[',
+            b'"accounts":["',
+            "its retracer.verdict record does not fit this version of retracer: JSON is malformed",
+        ),
+        (VERDICT, b'"end":', b'"ende":', "its retracer.verdict record does not fit this version of retracer"),
+        ("schema retracer.Step", b"integer", b"number", "its ledger is of another version of retracer"),
+        ("schema tests.sample_operators.Count", b'"value"', b'"number"', "Count.value is not in the recording"),
+        ("schema tests.sample_operators.Count", b"{", b"", "the schema of counter/count cannot be read"),
+        ("relay/step", b"\x9a", b"\x99", "relay/step number 0 is no step of a ledger"),
+        ("counter/count", b"\xa5value", b"\xa5valve", "it raised CodecError: not a Count"),
+    ],
+)
+def test_a_sound_file_with_other_content_is_refused_by_name(
+    record: Record, tmp_path: Path, where: str, old: bytes, new: bytes, words: str
+) -> None:
+    def change(name: str, data: bytes) -> bytes:
+        return data.replace(old, new, 1) if name == where else data
+
+    recording = record()
+    _, sentence = _read(_remade(recording, tmp_path / "other.mcap", change))
+    if not sentence:
+        sentence = "\n".join(lines(replay(Recording(tmp_path / "other.mcap"))))
+    assert words in sentence
 
 
 def test_missing_files_and_folders_are_named(tmp_path: Path) -> None:
