@@ -12,9 +12,10 @@ from sim.steering import STAND, STAND_SHARE, walk
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
-STEP = 0.05  # seconds of one update
+STEP = 0.05  # seconds of one update, about
 FRONT = (1.0, 1.25)  # metres in front of the robot at which a follower aims
 ASIDE = 1.0  # radians by which that point may be off the robot's heading
+KEPT = 5.0  # seconds, on average, until a follower chooses another such point
 TURN_RATE = 4.0  # rad/s at which a body turns to where it goes
 MOVES = 0.1  # m/s above which a body counts as moving
 
@@ -38,7 +39,7 @@ class Crowd:
         self.velocity = np.zeros((count, 2))
         self.walked = rng.uniform(0.0, 2.0, count)  # metres, so that not all feet are in step
         self.standing = np.where(rng.random(count) < STAND_SHARE, rng.uniform(*STAND, count), 0.0) * ~following
-        self.offset = np.stack([rng.uniform(*FRONT, count), rng.uniform(-ASIDE, ASIDE, count)], 1)
+        self.offset = self._offsets()
 
     def advance(
         self, seconds: float, free: Clearance, robot: tuple[float, float, float], near: Flags | None = None
@@ -47,23 +48,32 @@ class Crowd:
 
         A follower that does not see the robot wanders.
         """
+        count = len(self.position)
+        anew = self.rng.random(count) < seconds / KEPT
+        self.offset = np.where(anew[:, None], self._offsets(), self.offset)
         low = np.array([free.x, free.y])
         place = np.array(robot[:2])
         bearing = robot[2] + self.offset[:, 1]
         aim = place + self.offset[:, :1] * np.stack([np.cos(bearing), np.sin(bearing)], 1)
         follows = self.following if near is None else self.following & near
-        count = len(self.position)
-        for _ in range(round(seconds / STEP)):
+        steps = max(1, round(seconds / STEP))
+        step = seconds / steps
+        for _ in range(steps):
             draws = np.stack([self.rng.standard_normal(count), self.rng.random(count), self.rng.uniform(*STAND, count)])
             walk(
                 self.position, self.velocity, self.heading, self.standing, follows, self.attentive,
-                self.pace, aim, draws, place, free.distance, low, free.resolution, STEP,
+                self.pace, aim, draws, place, free.distance, low, free.resolution, step,
             )  # fmt: skip
             pace = np.hypot(*self.velocity.T)
-            self.walked += pace * STEP
+            self.walked += pace * step
             went = np.arctan2(self.velocity[:, 1], self.velocity[:, 0])
             turn = np.where(pace > 0.15, went - self.facing, 0.0)
-            self.facing += np.clip((turn + np.pi) % (2 * np.pi) - np.pi, -TURN_RATE * STEP, TURN_RATE * STEP)
+            self.facing += np.clip((turn + np.pi) % (2 * np.pi) - np.pi, -TURN_RATE * step, TURN_RATE * step)
+
+    def _offsets(self) -> Array:
+        """Draw the places in front of the robot, as distance and bearing (n, 2)."""
+        count = len(self.position)
+        return np.stack([self.rng.uniform(*FRONT, count), self.rng.uniform(-ASIDE, ASIDE, count)], 1)
 
     def moving(self) -> Flags:
         """Say who moves right now."""

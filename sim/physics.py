@@ -15,8 +15,9 @@ from sim.solids import Body
 Array = npt.NDArray[np.float64]
 
 SUBSTEP = 1.0 / 240.0  # seconds
-LENGTH, WIDTH, HEIGHT = 0.42, 0.31, 0.18  # metres, of the chassis
-GROUND_CLEARANCE = 0.05
+LENGTH, WIDTH, HEIGHT = 0.42, 0.31, 0.22  # metres, of the chassis
+GROUND_CLEARANCE = 0.01  # metres: a skirt, or the robot would climb on people's feet
+BALLAST = 0.06  # metres of the centre of mass below the middle of the chassis
 WHEEL_RADIUS, WHEEL_WIDTH, TRACK = 0.085, 0.03, 0.26  # metres
 MASS, WHEEL_MASS = 14.0, 0.8  # kg
 MOTOR = 6.0  # N m, the most a wheel's motor gives
@@ -87,7 +88,7 @@ class Physics:
             chassis,
             basePosition=[x, y, middle],
             baseOrientation=p.getQuaternionFromEuler([0, 0, yaw]),
-            baseInertialFramePosition=[0, 0, -0.05],
+            baseInertialFramePosition=[0, 0, -BALLAST],
             linkMasses=[WHEEL_MASS, WHEEL_MASS, 0.1, 0.1],
             linkCollisionShapeIndices=[wheel, wheel, ball, ball],
             linkVisualShapeIndices=[-1] * 4,
@@ -152,7 +153,7 @@ class Physics:
         velocity, spin = p.getBaseVelocity(self.robot, physicsClientId=self.client)
         pose = np.eye(4)
         pose[:3, :3] = np.array(p.getMatrixFromQuaternion(turn)).reshape(3, 3)
-        pose[:3, 3] = np.array(place) + pose[:3, :3] @ [0.0, 0.0, 0.05 - GROUND_CLEARANCE - HEIGHT / 2]
+        pose[:3, 3] = np.array(place) + pose[:3, :3] @ [0.0, 0.0, BALLAST - GROUND_CLEARANCE - HEIGHT / 2]
         states = p.getJointStates(self.robot, [0, 1], physicsClientId=self.client)
         forward = float(np.dot(velocity, pose[:3, 0]))
         return Motion(pose, forward, float(spin[2]), (states[0][0], states[1][0]))

@@ -20,6 +20,7 @@ Flags = npt.NDArray[np.bool_]
 MARGIN = 0.5  # metres: people and obstacles push within it
 BODY = 0.22  # metres: half the breadth of a person
 ROBOT = 0.27  # metres: half the diagonal of the robot
+REACH = 0.52  # metres from the robot's middle within which nobody steps nearer: half its diagonal, and a foot ahead
 BREATH = 0.38  # metres between the middles of two people, at the least
 TURNING = 0.6  # rad/sqrt(s), of a wanderer's heading
 STAND_SHARE = 0.2  # of its time that a wanderer stands
@@ -158,7 +159,7 @@ def walk(
             there = sample(distance, (nx - low[0]) / resolution, (ny - low[1]) / resolution)
             free = there >= BODY or there > here
             reach = math.hypot(nx - robot[0], ny - robot[1])
-            free = free and (reach > ROBOT + BODY - 0.12 or reach >= apart)
+            free = free and (reach > REACH or reach >= apart)
             for n in range(found):
                 between = math.hypot(nx - old[near[n], 0], ny - old[near[n], 1])
                 free = free and (between > BREATH or between >= math.hypot(x - old[near[n], 0], y - old[near[n], 1]))

@@ -209,11 +209,12 @@ class World:
         self.physics.drive(linear, angular)
         self.trail = [base]
         touched: set[int] = set()
-        rounds = max(1, round(seconds / SUBSTEP / GLIDE))
-        for glide in range(1, rounds + 1):
-            share = glide / rounds
+        substeps = round((self.time + seconds) / SUBSTEP) - round(self.time / SUBSTEP)
+        glides = max(1, round(substeps / GLIDE))
+        for glide in range(glides):
+            share = (glide + 1) / glides
             self.physics.place_people(self.bodies_before * (1.0 - share) + self.capsules * share, self.radii)
-            for _ in range(GLIDE):
+            for _ in range(glide * substeps // glides, (glide + 1) * substeps // glides):
                 self.physics.step()
                 still, people = self.physics.contacts()
                 touched |= {1 + body for body in still} | {len(self.bodies) + person for person in people}

@@ -70,6 +70,18 @@ def test_a_step_takes_a_command_too() -> None:
     np.testing.assert_array_equal(frames[0].points, frames[1].points)
 
 
+@pytest.mark.parametrize("rate", [7.0, 15.0, 20.0])
+def test_a_second_is_a_second_at_any_rate(rate: float) -> None:
+    world = World(box_room(30.0, 12.0), Scenario(tables=(0.0, 0.0), wanderers=0.02), "A", 0, odometry=QUIET)
+    for _ in range(round(3 * rate)):
+        world.advance(1.0, 0.0, 1.0 / rate)
+    assert world.time == pytest.approx(3.0)
+    moved = world.motion.world_from_base[0, 3] - 15.0
+    assert moved == pytest.approx(3.0 - 0.5 / ACCELERATION, abs=0.03)
+    walked = world.crowd.walked - World(world.building, world.scenario, "A", 0).crowd.walked
+    assert 1.5 < walked.max() < 3.0
+
+
 def test_no_command_exceeds_what_the_robot_can() -> None:
     world = World(box_room(30.0, 12.0), NOBODY, "A", 0)
     for _ in range(30):
