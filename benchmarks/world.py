@@ -40,6 +40,18 @@ def row(name: str, value: float, unit: str) -> dict[str, Any]:
     return {"name": name, "value": value, "unit": unit, "peer": None, "peer_value": None, "ratio": None}
 
 
+def session(scenario: str) -> tuple[float, float]:
+    """Let people walk for a minute; return their mean speed while moving, m/s, and the share still in rooms, %."""
+    from sim.world import World
+
+    world = World("default", scenario, "A", 1)
+    speeds = []
+    for _ in range(600):
+        world.walk(0.1)
+        speeds.append(np.hypot(*world.crowd.velocity.T)[world.crowd.moving()])
+    return float(np.concatenate(speeds).mean()), 100.0 * world.still_there()
+
+
 def rows() -> list[dict[str, Any]]:
     """Measure the steps of the scenarios, and how they grow with the number of people."""
     from operators.simulator import Simulator  # here: the extra `sim` may be absent
@@ -54,6 +66,10 @@ def rows() -> list[dict[str, Any]]:
         name = f"world step {scenario}, {lidar} lidar, {people} people"
         found.append(row(f"{name}, median", 1000.0 * float(np.median(seconds)), "ms"))
         found.append(row(f"{name}, p95", 1000.0 * float(np.percentile(seconds, 95)), "ms"))
+    for scenario in ("easy", "medium", "hard", "extreme"):
+        speed, share = session(scenario)
+        found.append(row(f"world {scenario}, mean speed of those who move", speed, "m/s"))
+        found.append(row(f"world {scenario}, people in their rooms after 60 s", share, "%"))
     medians = []
     for count in CROWDS:
         simulator = Simulator(Simulator.Config(scenario="mapping", seed=1))

@@ -187,9 +187,10 @@ class World:
 
     def step(self, linear: float | Drive, angular: float = 0.0, seconds: float = 0.1) -> Frame:
         """Drive for a while, then scan. linear: m/s, or a command of both; angular: rad/s."""
-        if not isinstance(linear, (int, float)):
-            linear, angular = linear.linear, linear.angular
-        self.advance(linear, angular, seconds)
+        if isinstance(linear, (int, float)):
+            self.advance(linear, angular, seconds)
+        else:
+            self.advance(linear.linear, linear.angular, seconds)
         return self.scan()
 
     def walk(self, seconds: float) -> None:
