@@ -17,6 +17,8 @@ import msgspec
 import zenoh
 
 STALL = 30  # seconds that a stuck reader may take before its transport is closed
+POOL = 16 << 20  # bytes of shared memory for the large messages of one process
+LARGE = 1 << 15  # bytes of a message that goes through it; smaller ones fit a packet
 
 _ENVELOPE = struct.Struct("<IQq")  # incarnation, sequence, stamp
 
@@ -47,6 +49,7 @@ def _configuration(mode: str, endpoint: str) -> zenoh.Config:
         ("listen" if mode == "router" else "connect") + "/endpoints": f'["{endpoint}"]',
         "transport/shared_memory/enabled": "true",
         "transport/shared_memory/mode": '"init"',
+        "transport/shared_memory/transport_optimization/enabled": "false",  # it copies twice; Wire.put does it once
         "transport/link/tx/lease": str(STALL * 1000),
         "transport/link/tx/queue/congestion_control/block/wait_before_close": str(STALL * 1_000_000),
     }
@@ -67,6 +70,7 @@ class Wire:
         self.inbox: queue.SimpleQueue[Sample] = queue.SimpleQueue()
         self.publishers: dict[str, zenoh.Publisher] = {}
         self.tokens: list[zenoh.LivelinessToken] = []
+        self.pool: zenoh.shm.ShmProvider | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -121,7 +125,18 @@ class Wire:
         if key not in self.publishers:
             self.announce(key)
         attachment = None if envelope is None else _ENVELOPE.pack(*envelope) + mark
-        self.publishers[key].put(payload, attachment=attachment)
+        self.publishers[key].put(payload if len(payload) < LARGE else self._shared(payload), attachment=attachment)
+
+    def _shared(self, payload: bytes) -> bytes | zenoh.shm.ZShmMut:
+        """Copy a payload into shared memory; as it is where there is none, or readers still hold all of it."""
+        try:
+            if self.pool is None:
+                self.pool = zenoh.shm.ShmProvider.default_backend(POOL)
+            buffer = self.pool.alloc(len(payload), zenoh.shm.GarbageCollect())
+            buffer[:] = payload
+        except zenoh.ZError:
+            return payload
+        return buffer
 
     def tell(self, key: str, record: msgspec.Struct) -> None:
         """Put one of the runtime's own records."""
