@@ -55,6 +55,15 @@ class _Mixing:
     def _count(self) -> Count:
         return Count(measured_at=self.calls, value=self.state)
 
+    def on_start(self) -> Iterator[MixerOutputs | End] | None:
+        return self._once() if self.config.starts else None
+
+    def _once(self) -> Iterator[MixerOutputs]:
+        yield MixerOutputs(x=self._count(), y=self._count())
+
+    def on_end(self) -> Iterator[MixerOutputs] | None:
+        return self._once() if self.config.ends else None
+
 
 class Mixer(_Mixing, Operator):
     """Mix numbers of up to four ports, and ticks of two timers, into one state; say it now and then."""
@@ -65,12 +74,6 @@ class Mixer(_Mixing, Operator):
     def __init__(self, config: MixerConfig | None = None) -> None:
         Operator.__init__(self, config)
         _Mixing.__init__(self)
-
-    def on_start(self) -> Iterator[MixerOutputs | End] | None:
-        return self._once() if self.config.starts else None
-
-    def _once(self) -> Iterator[MixerOutputs]:
-        yield MixerOutputs(x=self._count(), y=self._count())
 
     def on_slow(self, tick: Tick | None) -> Iterator[MixerOutputs | End]:
         return self.mix(1, tick.measured_at)
@@ -89,9 +92,6 @@ class Mixer(_Mixing, Operator):
 
     def on_d(self, count: Count | None) -> Iterator[MixerOutputs | End]:
         return self.mix(6, count.value)
-
-    def on_end(self) -> Iterator[MixerOutputs] | None:
-        return self._once() if self.config.ends else None
 
 
 class MixerSource(_Mixing, Source):
