@@ -150,5 +150,7 @@ class Simulator(Operator):
             collisions_with_people=collisions["people"],
             collisions_with_things=collisions["things"],
             people=len(self.world.person_truth),
+            walkers=len(self.world.crowd.position),
+            walkers_wanted=self.world.wanted_people,
             people_still_there=self.world.still_there(),
         )
