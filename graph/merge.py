@@ -236,7 +236,6 @@ def _shortcomings(
 ) -> list[str]:
     """Say in sentences what keeps a run from being complete."""
     why = [f"{name} did not come to its end" for name in specs if name not in ended and specs[name].kind != "sink"]
-    why += [f"{item.path.name} is cut short: {item.damage}" for item in readers if item.damage and item.ended]
     why += [
         f"{account.lost} of {account.emitted} messages were lost from {account.topic} to {account.operator}"
         for account in accounts

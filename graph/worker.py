@@ -55,6 +55,7 @@ class Worker:
         self.reported: tuple[object, ...] = ()
         self.report_at = 0.0
         self.demand = threading.Semaphore(0)
+        self.failure: BaseException | None = None  # of the stream
         self._subscribe()
 
     def _subscribe(self) -> None:
@@ -89,8 +90,8 @@ class Worker:
                 self.wire.inbox.put(Sample("stream", b"", (0, 0, INFINITY if stamp is None else stamp)))
                 if stamp is None:
                     return
-        except BaseException:
-            traceback.print_exc()
+        except BaseException as error:
+            self.failure = error
             self.wire.inbox.put(Sample("failed", b"", (0, 0, 0)))
 
     def drain(self, timeout: float | None) -> bool:
@@ -125,7 +126,8 @@ class Worker:
             if self.realtime and sample.envelope[2] == INFINITY and self.spec.end == self.spec.name:
                 self.own_end = self.realtime.handled
         elif kind == "failed":
-            raise SystemExit(1)
+            assert self.failure is not None
+            raise self.failure
         elif kind == "control":
             self._obey(msgspec.msgpack.decode(sample.payload, type=Control))
 
