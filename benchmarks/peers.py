@@ -1,4 +1,4 @@
-"""The same cloud over peers: bare Zenoh as the runtime configures it, and dora-rs. Run as a program, one end of it."""
+"""The same cloud over peers: bare Zenoh, a put and a callback, and dora-rs. Run as a program, one end of it."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 
 import numpy as np
+import zenoh
 
 from benchmarks.stations import POINTS, WARM_UP
-from graph.transport import Wire, free_port
+from graph.transport import free_port
 
 DATAFLOW = """
 nodes:
@@ -34,10 +36,21 @@ def bytes_of_cloud() -> np.ndarray:
     return np.random.default_rng(0).random(3 * POINTS, np.float32)
 
 
+def _session(mode: str, endpoint: str) -> zenoh.Session:
+    """Open Zenoh as it comes, but alone on this machine and with shared memory from the start."""
+    config = zenoh.Config()
+    side = "listen" if mode == "router" else "connect"
+    config.insert_json5("mode", f'"{mode}"')
+    config.insert_json5(f"{side}/endpoints", f'["{endpoint}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("transport/shared_memory/mode", '"init"')
+    return zenoh.open(config)
+
+
 def zenoh_latencies(count: int, hertz: float) -> np.ndarray:
     """Send clouds client to router to client by plain puts, shared memory on. Returns (count,) in milliseconds."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with Wire(endpoint, "bench", router=True):
+    with _session("router", endpoint):
         meter = _end("zenoh-meter", endpoint, str(count))
         assert meter.stdout is not None
         meter.stdout.readline()
@@ -72,28 +85,34 @@ def _end(*arguments: str) -> subprocess.Popen[str]:
 
 
 def zenoh_meter(endpoint: str, count: int) -> None:
-    """Receive clouds in one thread off one queue, as an operator does."""
-    with Wire(endpoint, "bench") as wire:
-        wire.subscribe("cloud")
+    """Receive clouds in the callback, as bytes, which is all that Zenoh gives a Python program."""
+    latencies: list[int] = []
+    full = threading.Event()
+
+    def receive(sample: zenoh.Sample) -> None:
+        sample.payload.to_bytes()
+        assert sample.attachment is not None
+        latencies.append(time.monotonic_ns() - int.from_bytes(sample.attachment.to_bytes(), "little"))
+        if len(latencies) == count:
+            full.set()
+
+    with _session("client", endpoint) as session:
+        session.declare_subscriber("bench/cloud", zenoh.handlers.Callback(receive, indirect=False))
         print("ready", flush=True)
-        latencies = []
-        while len(latencies) < count:
-            sample = wire.inbox.get()
-            latencies.append(time.monotonic_ns() - sample.envelope[2])
+        full.wait()
         print(json.dumps(latencies), flush=True)
 
 
 def zenoh_maker(endpoint: str, count: int, hertz: float) -> None:
     """Put clouds, the clock in the attachment."""
-    data = bytes_of_cloud()
-    with Wire(endpoint, "bench") as wire:
-        wire.announce("cloud")
+    data = bytes_of_cloud().tobytes()
+    with _session("client", endpoint) as session:
+        publisher = session.declare_publisher("bench/cloud", congestion_control=zenoh.CongestionControl.BLOCK)
         time.sleep(0.5)
-        for number in range(count + 5):
-            payload = data.tobytes()
-            wire.put("cloud", payload, (0, number, time.monotonic_ns()))
+        for _ in range(count):
+            publisher.put(data, attachment=time.monotonic_ns().to_bytes(8, "little"))
             time.sleep(1.0 / hertz)
-        time.sleep(30)
+        time.sleep(30)  # the other end may still read our memory
 
 
 def dora_maker(count: int) -> None:

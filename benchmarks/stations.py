@@ -22,11 +22,12 @@ def cloud(points: int, seed: int = 0, measured_at: int = 0) -> PointCloud:
 
 
 class CloudMaker(Operator):
-    """Send the same cloud at each tick, with the monotonic clock at the moment of sending in `measured_at`."""
+    """Send the same cloud at each tick; if `timed`, with the monotonic clock at that moment in `measured_at`."""
 
     class Config(msgspec.Struct):
         points: int = POINTS
         count: int = 100
+        timed: bool = True
 
     class Outputs(msgspec.Struct):
         cloud: PointCloud | None = None
@@ -38,9 +39,8 @@ class CloudMaker(Operator):
 
     def on_tick(self, tick: Tick) -> Iterator[CloudMaker.Outputs | End]:
         self.sent += 1
-        yield self.Outputs(
-            PointCloud(measured_at=time.monotonic_ns(), points=self.points, base_from_lidar=self.base_from_lidar)
-        )
+        at = time.monotonic_ns() if self.config.timed else tick.measured_at
+        yield self.Outputs(PointCloud(measured_at=at, points=self.points, base_from_lidar=self.base_from_lidar))
         if self.sent == self.config.count:
             yield End()
 
@@ -56,6 +56,15 @@ class CloudMeter(Operator):
 
     def on_end(self) -> Summary:
         return Summary(latencies=self.latencies[WARM_UP:])
+
+
+class CloudPass(Operator):
+    """Pass a cloud on."""
+
+    Outputs = CloudMaker.Outputs
+
+    def on_cloud(self, cloud: PointCloud) -> CloudMaker.Outputs:
+        return self.Outputs(cloud)
 
 
 class Number(Message, frozen=True, kw_only=True, eq=False):

@@ -15,7 +15,8 @@ from graph.check import require
 from graph.launcher import launch
 from graph.recording import Recording
 
-COUNT = 300  # clouds
+ROUNDS = 3  # each measures all in turn, since a machine is not the same a minute later
+COUNT = 100  # clouds in a round
 HERTZ = 20.0
 
 GRAPH = """
@@ -41,16 +42,19 @@ def latencies(count: int = COUNT, hertz: float = HERTZ) -> np.ndarray:
 
 def rows() -> list[dict[str, Any]]:
     """Measure ours and the peers' in one run."""
-    ours = latencies()
-    found: list[dict[str, Any]] = []
-    for peer, measure in (("bare Zenoh", zenoh_latencies), ("dora-rs", dora_latencies)):
-        try:
-            theirs = measure(COUNT + WARM_UP, HERTZ)
-        except RuntimeError as error:
-            print(f"{peer} left out: {error}")
-            continue
-        found += list(_rows(ours, peer, theirs))
-    return found or list(_rows(ours, "", None))
+    peers = {"bare Zenoh": zenoh_latencies, "dora-rs": dora_latencies}
+    ours: list[np.ndarray] = []
+    theirs: dict[str, list[np.ndarray]] = {peer: [] for peer in peers}
+    for _ in range(ROUNDS):
+        ours.append(latencies())
+        for peer in list(peers):
+            try:
+                theirs[peer].append(peers[peer](COUNT + WARM_UP, HERTZ))
+            except RuntimeError as error:
+                print(f"{peer} left out: {error}")
+                del peers[peer]
+    found = [row for peer in peers for row in _rows(np.concatenate(ours), peer, np.concatenate(theirs[peer]))]
+    return found or list(_rows(np.concatenate(ours), "", None))
 
 
 def _rows(ours: np.ndarray, peer: str, theirs: np.ndarray | None) -> Iterator[dict[str, Any]]:
