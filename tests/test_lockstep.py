@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from graph.diff import compare
 from graph.errors import UserError
 from graph.graphfile import Clock, Edge, Graph, OperatorEntry
 from graph.inprocess import launch_in_process
+from graph.launcher import launch
 from graph.ledger import Mark
 from graph.lockstep import Arrival, GapError, Lockstep
 from graph.recording import Recording
@@ -42,11 +44,49 @@ def test_real_graphs_in_one_process_say_what_the_reference_says(
     for shuffle in (None, seed):
         verdict, path = launch_in_process(graph, record=folder / f"{shuffle}.mcap", shuffle=shuffle)
         assert (verdict.verdict, verdict.reasons) == ("COMPLETE", [])
-        ledger: Ledger = {name: [] for name in wanted}
-        for operator, _, step in Recording(path).steps(*wanted):
-            ledger[operator].append(step.facts())
-        assert ledger == wanted
+        assert ledger_of(Recording(path), wanted) == wanted
     assert compare(Recording(folder / "None.mcap"), Recording(path)).equal
+
+
+def ledger_of(recording: Recording, names: Iterable[str]) -> Ledger:
+    ledger: Ledger = {name: [] for name in names}
+    for operator, _, step in recording.steps(*ledger):
+        ledger[operator].append(step.facts())
+    return ledger
+
+
+def launched(graph: Graph, path: Path) -> None:
+    """Run a graph in processes of its own and hold every step against the reference."""
+    wanted = reference(graph)
+    outcome = launch(graph, record=path, quiet=True)
+    assert (outcome.verdict.verdict, outcome.verdict.reasons) == ("COMPLETE", [])
+    assert ledger_of(Recording(path), wanted) == wanted
+
+
+@pytest.mark.slow
+@settings(FIXED, max_examples=30)
+@given(graphs())
+def test_launched_graphs_say_what_the_reference_says(tmp_path_factory: pytest.TempPathFactory, graph: Graph) -> None:
+    launched(graph, tmp_path_factory.mktemp("random") / "run.mcap")
+
+
+def test_a_tangled_graph_in_processes_says_what_the_reference_says(tmp_path: Path) -> None:
+    graph = _graph(
+        Clock(end="one", ahead=7),
+        two=_mix(
+            {"a": Edge("one", "x"), "b": Edge("three", "y", 3), "fast": Edge("timer", "3ns")}, share=30, ends=True
+        ),
+        three=_mix({"a": Edge("two", "x"), "c": Edge("one", "y", 2), "d": Edge("two", "x", 4)}, share=40, starts=True),
+        source=OperatorEntry(f"{TRIALS}:MixerSource", {}, {"share": 90, "stamps": [0, 1, 5, 9, 30, 31], "ends": True}),
+        one=_mix(
+            {"slow": Edge("timer", "5ns", 2), "b": Edge("two", "y", 3), "d": Edge("one", "x", 9)}, share=40, last=16
+        ),
+        four=_mix({"a": Edge("source", "x"), "b": Edge("three", "x"), "slow": Edge("timer", "4ns")}, ends=True),
+        screen=OperatorEntry("tests.sample_operators:Screen", {"count": Edge("four", "x")}),
+    )
+    assert check(graph).mistakes == []
+    assert sum(map(len, reference(graph).values())) > 100
+    launched(graph, tmp_path / "run.mcap")
 
 
 def _graph(clock: Clock, **operators: OperatorEntry) -> Graph:
