@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -142,3 +146,41 @@ def test_logs_are_kept_in_the_recording(run: Run) -> None:
     logs = {item.name: item.data.decode() for item in recording.attachments()}
     assert set(logs) == {"log/failing.txt"}
     assert "RuntimeError: failed at 5, as configured" in logs["log/failing.txt"]
+
+
+def test_the_error_of_a_source_is_shown_once(run: Run) -> None:
+    source = "scans: {run: tests.trial_operators:Blocking, config: {fails: true}}"
+    recording = run(graph("lockstep", source, RELAY, duration="1s"))
+    assert "scans failed (exit code 1)" in recording.verdict.reasons
+    (log,) = [item.data.decode() for item in recording.attachments()]
+    assert log.count("Traceback") == 1
+    assert log.endswith("RuntimeError: unplugged\n")
+    assert replay(recording).equal
+
+
+def interrupt_when(shard: Path, word: bytes, times: int) -> threading.Thread:
+    """Press Ctrl-C, as it were, once a word stands so many times in a shard."""
+
+    def watch() -> None:
+        until = time.monotonic() + 60.0
+        while time.monotonic() < until and not (shard.exists() and shard.read_bytes().count(word) >= times):
+            time.sleep(0.02)
+        if shard.exists():
+            os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    return thread
+
+
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_a_source_that_waits_does_not_hold_up_ctrl_c(run: Run, tmp_path: Path, mode: str) -> None:
+    source = "scans: {run: tests.trial_operators:Blocking}"
+    shard = tmp_path / "run.shards" / "relay.0.mcap"
+    thread = interrupt_when(shard, b"scans/count", 3)
+    recording = run(graph(mode, source, RELAY, duration="600s"))
+    thread.join()
+    assert recording.verdict.verdict == "COMPLETE", recording.verdict.reasons
+    assert recording.verdict.end == 2000
+    assert recording.counts["relay/count"] == 3
+    assert replay(recording).equal

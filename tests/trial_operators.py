@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import time
 from collections.abc import Iterator
 
 import msgspec
@@ -154,3 +155,19 @@ class LastWords(Relay):
 
     def on_end(self) -> CountOutputs:
         return CountOutputs(Count(measured_at=0, value=-1))
+
+
+class Blocking(Source):
+    """Give three numbers, then fail, or wait for what never comes."""
+
+    class Config(msgspec.Struct):
+        fails: bool = False
+
+    Outputs = CountOutputs
+
+    def stream(self) -> Iterator[tuple[int, CountOutputs]]:
+        for index in range(3):
+            yield index * 1000, CountOutputs(Count(measured_at=index * 1000, value=index))
+        if self.config.fails:
+            raise RuntimeError("unplugged")
+        time.sleep(600.0)
