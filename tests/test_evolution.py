@@ -171,6 +171,6 @@ def test_what_is_played_back_must_be_readable_too(version: Callable[[str], Path]
 
 def test_another_ledger_is_refused(version: Callable[[str], Path]) -> None:
     recording = recorded(version, "")
-    recording.types["maker/step"] = ("retracer.Step", "{}")
+    recording.types["maker/step"] = ("retracer.Step", "{}")  # as if of another time
     with pytest.raises(UserError, match="its ledger is of another version of retracer"):
         replay(recording)

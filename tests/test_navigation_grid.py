@@ -281,3 +281,9 @@ def test_costs_that_are_kept_are_those_computed_anew():
         fresh.cells, fresh.obstacles = kept.cells, kept.obstacles
         fresh._stale = Box(0, fresh.lattice.rows, 0, fresh.lattice.columns)
         assert np.array_equal(weights, fresh.weights(where))
+
+
+def test_places_too_far_apart_are_named():
+    costmap = Costmap(lethal=0.2, inflation=0.8)
+    with pytest.raises(ValueError, match="span 1016 x 16 m; the planner's raster holds 250 m a side"):
+        costmap.cover((0.0, 0.0), (1000.0, 0.0))

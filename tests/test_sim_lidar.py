@@ -9,8 +9,9 @@ import pytest
 
 from graph.geometry import exponential, inverse, planar, transform
 from sim import World
-from sim.building import BuildingError
+from sim.building import BuildingError, Pillar
 from sim.lidar import NOTHING, PRESETS, Lidar, LidarSpec
+from sim.scenario import Scenario
 from sim.solids import Body, Box, Truth, triangles_of
 from sim.sweep import along
 from tests.small_rooms import NOBODY, box_room, two_rooms
@@ -18,6 +19,15 @@ from tests.small_rooms import NOBODY, box_room, two_rooms
 Array = npt.NDArray[np.float64]
 
 EXACT = LidarSpec(noise=0.0)
+
+
+@pytest.fixture(scope="module")
+def crowded() -> World:
+    """The fullest scenario, a moment after its start."""
+    world = World("default", "extreme", "A", 4, lidar=EXACT)
+    for _ in range(5):
+        world.advance(1.0, 0.3)
+    return world
 
 
 def seen(world: World) -> Array:
@@ -60,8 +70,8 @@ def test_ranges_are_multiples_of_the_step_and_within_the_limits() -> None:
     assert ranges.max() <= 5.001
 
 
-def test_turning_the_sensor_turns_the_cloud() -> None:
-    world = World("default", "medium", "A", 1, lidar=EXACT)
+def test_turning_the_sensor_turns_the_cloud(crowded: World) -> None:
+    world = crowded
     lidar, columns, beams = world.lidar, world.spec.columns, world.spec.beams
     pose, share = world.sensor()
     straight = lidar.shoot(pose, share, world.people())
@@ -86,11 +96,8 @@ def test_a_closed_door_occludes(angle: float | str, open_: bool) -> None:
         assert leaf.sum() > 100
 
 
-@pytest.mark.parametrize("scenario", ["easy", "extreme"])
-def test_labels_agree_with_the_body_that_was_hit(scenario: str) -> None:
-    world = World("default", scenario, "A", 4, lidar=EXACT)
-    for _ in range(5):
-        world.advance(1.0, 0.3)
+def test_labels_agree_with_the_body_that_was_hit(crowded: World) -> None:
+    world = crowded
     frame, points = world.scan(), seen(world)
     truth = world.truth[frame.instance]
     low = points[:, 2] < 0.05
@@ -137,7 +144,8 @@ def ranges_now(world: World, points: Array) -> tuple[Array, Array]:
 
 
 def test_a_rolling_scan_of_a_turning_robot_deskews_to_the_instantaneous_one() -> None:
-    world = World("default", "easy", "A", 2, lidar="paper", rolling=True)
+    pillars = [Pillar((3.0, 2.0)), Pillar((9.0, 8.0)), Pillar((4.0, 7.0), (1.0, 0.3), 30.0)]
+    world = World(box_room(12.0, 10.0, pillars=pillars), NOBODY, "A", 2, rolling=True)
     for _ in range(12):
         world.advance(0.0, 1.0)
     swept = world.scan()
@@ -158,7 +166,7 @@ def test_a_rolling_scan_of_a_turning_robot_deskews_to_the_instantaneous_one() ->
 
 
 def test_people_walk_on_during_a_sweep() -> None:
-    world = World("default", "extreme", "A", 2, lidar=EXACT, rolling=True)
+    world = World(two_rooms(90.0), Scenario(wanderers=0.2), "A", 2, lidar=EXACT, rolling=True)
     for _ in range(8):
         world.advance(0.0, 0.0)
     frame = world.scan()
@@ -189,8 +197,8 @@ def test_columns_of_a_sweep_lie_on_the_way() -> None:
 
 
 def test_returns_are_dropped_at_grazing_incidence_and_far_away_only() -> None:
-    whole = World("default", "mapping", "A", 1, lidar=EXACT)
-    holed = World("default", "mapping", "A", 1, lidar=EXACT, dropout=0.8)
+    hall = box_room(50.0, 40.0)
+    whole, holed = World(hall, NOBODY, "A", 1, lidar=EXACT), World(hall, NOBODY, "A", 1, lidar=EXACT, dropout=0.8)
     few, all_ = holed.scan(), whole.scan()
     assert 0.3 * len(all_.points) < len(few.points) < 0.98 * len(all_.points)
     near = lambda frame: (np.linalg.norm(frame.points, axis=1) < 2.3) & (frame.truth == Truth.GROUND)  # noqa: E731

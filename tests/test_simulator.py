@@ -172,9 +172,9 @@ def test_lidar_and_odometry_are_settings(files: tuple[Path, str]) -> None:
     assert simulator.world.odometer.scale == 1.0
 
 
-def test_two_simulators_of_one_config_agree_to_the_bit() -> None:
-    config = Simulator.Config(scenario="medium", tour="B", seed=9)
-    one, two = Simulator(config), Simulator(config)
+def test_two_simulators_of_one_config_agree_to_the_bit(files: tuple[Path, str]) -> None:
+    one, two = (make((files[0], "extreme"), seed=9) for _ in range(2))
+    assert len(one.world.crowd.position) == 12
     for index in range(4):
         for simulator in (one, two):
             simulator.on_drive(Drive(measured_at=0, linear=0.7, angular=0.4))

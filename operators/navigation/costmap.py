@@ -18,6 +18,7 @@ CELL = 0.05  # metres, of the map and of the local window
 COARSE = 2  # cells of the map along one of the search's
 BLOCK = 160  # cells by which the raster grows: 8 m
 OCCUPIED = 50  # value of a map's cell from which it counts as occupied
+LARGEST = 250.0  # metres from border to border: 25 million cells, 800 MB
 MARGIN = 4.0  # metres of unknown floor kept around all that matters, so that a way can lead around
 
 FREE = 8  # weight of open floor: whole numbers with room for an eighth
@@ -83,7 +84,7 @@ def _changed(old: npt.NDArray[np.int8], new: npt.NDArray[np.int8]) -> tuple[int,
 
 
 FAR_AWAY = (-1e6, -1e6)  # where no robot is
-NOWHERE = Box(0, 0, 0, 0)
+EMPTY = Box(0, 0, 0, 0)
 
 
 class Costmap:
@@ -101,10 +102,10 @@ class Costmap:
         self.obstacles = ObstacleLayer(self.lattice, reach=reach)
         self._distance = np.full((0, 0), inflation, np.float32)
         self._weights = np.full((0, 0), FREE + UNKNOWN, np.int32)  # coarse
-        self._stale = NOWHERE  # cells whose distances and weights are to be computed anew
+        self._stale = EMPTY  # cells whose distances and weights are to be computed anew
 
     def cover(self, *positions: tuple[float, float]) -> None:
-        """Grow the raster so that it reaches MARGIN beyond each position (x, y in metres)."""
+        """Grow the raster to reach MARGIN beyond each position (x, y in metres). Raises ValueError when too far."""
         if all(self.lattice.covers(x, y, MARGIN) for x, y in positions):
             return
         places = np.array(positions)
@@ -112,6 +113,11 @@ class Costmap:
 
     def _grow(self, wanted: Lattice) -> None:
         lattice = union(self.lattice, wanted) if self.lattice.rows else wanted
+        if max(lattice.rows, lattice.columns) * CELL > LARGEST:
+            sides = f"{lattice.columns * CELL:.0f} x {lattice.rows * CELL:.0f} m"
+            raise ValueError(
+                f"Robot, goal and map together span {sides}; the planner's raster holds {LARGEST:.0f} m a side"
+            )
         if lattice == self.lattice:
             return
         self.cells = moved(self.cells, self.lattice, lattice, -1)
@@ -184,7 +190,7 @@ class Costmap:
         box = Box(inner.top // COARSE, -(-inner.bottom // COARSE), inner.left // COARSE, -(-inner.right // COARSE))
         costs = self.lethal, self.inflation
         weigh(self._weights, self._distance, self.cells, self.obstacles.seen, *costs, box, FAR_AWAY)
-        self._stale = NOWHERE
+        self._stale = EMPTY
 
     def trust(self, x: float, y: float, radius: float) -> None:
         """Take for free what nobody has seen within `radius` metres of a position."""

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from operators.pointmap.nearest import nearest
-from operators.pointmap.store import BLOCK_VOXELS, CELL_BLOCKS, NORMAL, SCORE, empty_store, insert, with_room
+from operators.pointmap.store import BLOCK_VOXELS, CELL_BLOCKS, NONE, NORMAL, SCORE, empty_store, insert, with_room
 
 Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]
@@ -25,6 +25,12 @@ class MapPoints(NamedTuple):
     scores: Floats  # trust in the normals
     movable: Floats | None = None  # movable probability
     label: npt.NDArray[np.uint8] | None = None  # 0 uncertain, 1 ground, 2 permanent, 3 longT, 4 shortT
+
+    def kept(self, chosen: npt.NDArray[Any]) -> MapPoints:
+        """Return the chosen points, by mask or by index."""
+        movable = None if self.movable is None else self.movable[chosen]
+        label = None if self.label is None else self.label[chosen]
+        return MapPoints(self.points[chosen], self.normals[chosen], self.scores[chosen], movable, label)
 
 
 def cell_order(points: Floats, edge: float) -> npt.NDArray[np.int64]:
@@ -74,12 +80,21 @@ class VoxelMap:
             insert(self.store, points[part], normals[part], scores[part], frame, self.voxel_size)
         return len(self) - before
 
-    def insert_map(self, cloud: MapPoints) -> int:
-        """Add the points of an initial map, neighbours in space as neighbours in memory; returns how many are kept."""
+    def insert_map(self, cloud: MapPoints) -> npt.NDArray[np.int64]:
+        """Add the points of an initial map, neighbours in space as neighbours in memory.
+
+        Returns which points of the cloud were kept (k,), in the order of their new numbers: the first of each voxel.
+        """
         block, cell = BLOCK_VOXELS * self.voxel_size, CELL_BLOCKS * BLOCK_VOXELS * self.voxel_size
         order = cell_order(cloud.points, block)
         order = order[cell_order(cloud.points[order], cell)]
-        return self.insert(cloud.points[order], cloud.normals[order], cloud.scores[order], INITIAL)
+        before = len(self)
+        self.insert(cloud.points[order], cloud.normals[order], cloud.scores[order], INITIAL)
+        if len(self) - before == len(order):
+            return order
+        found, _ = self.nearest(cloud.points[order], 1e-3 * self.voxel_size)
+        _, first = np.unique(np.where(found >= before, found, NONE), return_index=True)
+        return order[first[-(len(self) - before) :]] if len(self) > before else order[:0]
 
     def nearest(self, points: Floats, reach: float = 2.0) -> tuple[Ints, npt.NDArray[np.float64]]:
         """Return the map point nearest each of the points (n, 3), -1 beyond `reach` metres, and its distance (n,)."""

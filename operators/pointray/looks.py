@@ -35,8 +35,7 @@ Counts = npt.NDArray[np.int32]  # (n, 4): LOOKS, FREE, STAMP of the last frame t
 
 LOOKS, FREE, STAMP = 0, 1, 2
 LEAST_RANGE = 0.06  # metres; nearer there is only the robot
-LEVEL = 0.5  # a normal with |z| above it may be looked at from any side: table tops are always seen at a grazing angle
-GRAZING_COSINE = math.cos(5.0 * math.pi / 12.0)  # other surfaces say nothing beyond 75 degrees of incidence
+GRAZING_COSINE = math.cos(5.0 * math.pi / 12.0)  # a surface says nothing beyond 75 degrees of incidence
 
 
 def masks_along(stride: int) -> Longs:
@@ -182,13 +181,20 @@ def gather_cell(
 
 @njit(cache=True, error_model="numpy")
 def see_through(
-    store: Store, counts: Counts, frustums: Frustums, lidar_from_world: Doubles, box: Doubles, voxel: float, frame: int
+    store: Store,
+    counts: Counts,
+    frustums: Frustums,
+    lidar_from_world: Doubles,
+    box: Doubles,
+    voxel: float,
+    level: float,
+    frame: int,
 ) -> int:
     """Look at every map point in front of what was measured in its direction: it is not there (paper eq. 2).
 
-    box: (2, 3) low and high corner of the frame in the world. voxel: of the map, metres. A point that this frame has
-    found occupied stays so. Cells of 32 voxels that lie outside the box or behind everything are passed over. Returns
-    how many points were tried.
+    box: (2, 3) low and high corner of the frame in the world. voxel: of the map, metres. level: a normal with |z| above
+    it counts at any incidence. A point that this frame has found occupied stays so. Cells of 32 voxels that lie outside
+    the box or behind everything are passed over. Returns how many points were tried.
     """
     m, pool, rows, cells = lidar_from_world, store.pool, store.rows, store.cells
     free, lowest = frustums.free, frustums.lowest
@@ -230,7 +236,7 @@ def see_through(
             along = x[n] * (m[0, 0] * nx + m[0, 1] * ny + m[0, 2] * nz)
             along += y[n] * (m[1, 0] * nx + m[1, 1] * ny + m[1, 2] * nz)
             along += z[n] * (m[2, 0] * nx + m[2, 1] * ny + m[2, 2] * nz)
-            if abs(nz) > LEVEL or abs(along) > GRAZING_COSINE * rho[n]:
+            if abs(nz) > level or abs(along) > GRAZING_COSINE * rho[n]:
                 counts[point, LOOKS] += 1
                 counts[point, FREE] += 1
     return tried

@@ -27,6 +27,9 @@ class RaySettings(NamedTuple):
     height: float = math.radians(1.33)  # the lidar's vertical resolution
     width: float = math.radians(0.1)
     least_looks: int = 10
+    level: float = (
+        0.5  # |z| of a normal above which any incidence counts: table tops are always seen at a grazing angle
+    )
 
 
 class PointRay:
@@ -57,7 +60,9 @@ class PointRay:
             self.touched = np.zeros(len(store.table), np.int64)
         see_occupied(store, self.counts, distinct_voxels(world, size), self.touched, self.frames)
         box = np.stack([world.min(axis=0), world.max(axis=0)])
-        tried = see_through(store, self.counts, frustums, inverse(world_from_lidar), box, size, self.frames)
+        tried = see_through(
+            store, self.counts, frustums, inverse(world_from_lidar), box, size, self.settings.level, self.frames
+        )
         self.frames += 1
         return int(tried)
 

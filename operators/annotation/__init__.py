@@ -1,0 +1,1 @@
+"""Sessions label themselves (paper section III-C), arrays in, arrays out."""

@@ -1,0 +1,54 @@
+"""Drop from a map what sessions saw through (paper section III-C, step 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from operators.annotation.floor import floor_points
+from operators.annotation.session import Floats, Session
+from operators.pointmap import MapPoints, VoxelMap, find_ground
+from operators.pointray import PointRay, RaySettings
+
+
+class Refinement(NamedTuple):
+    """When a point leaves the map."""
+
+    threshold: float = 0.9  # movable probability; high, for what is missed now will be caught by another session
+    tolerance: float = 0.10  # metres; ground never leaves
+    clearance: float = 0.10
+
+
+def movable_in(cloud: MapPoints, session: Session, rays: RaySettings) -> tuple[Floats, npt.NDArray[np.int32]]:
+    """Return movable probability and looks (n,) of the points of a map by the valid frames of one session."""
+    voxels = VoxelMap()
+    order = voxels.insert_map(cloud)
+    tracer = PointRay(voxels, rays)
+    for number in range(len(session)):
+        scan = session[number]
+        if scan.valid:
+            tracer.add(scan.points, scan.world_from_lidar)
+    movable, looks = np.full(len(cloud.points), 0.5, np.float32), np.zeros(len(cloud.points), np.int32)
+    movable[order], looks[order] = tracer.movable(), tracer.looks()
+    return movable, looks
+
+
+def refine(
+    cloud: MapPoints, movable: Iterable[Floats], settings: Refinement | None = None
+) -> tuple[MapPoints, npt.NDArray[np.bool_]]:
+    """Return the map without what any session saw through, and which points stayed.
+
+    movable: probabilities (n,) of the points of the map, one array for each accepted session. Ground always stays.
+    """
+    settings = Refinement() if settings is None else settings
+    worst = np.zeros(len(cloud.points), np.float32)
+    for probabilities in movable:
+        worst = np.maximum(worst, probabilities)
+    stays = worst < settings.threshold
+    plane = find_ground(cloud.points, cloud.normals)
+    if plane is not None:
+        stays |= floor_points(cloud.points, plane, settings.tolerance, settings.clearance)
+    return cloud.kept(stays)._replace(movable=worst[stays]), stays
