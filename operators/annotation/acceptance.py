@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from operators.annotation.session import Session
+from operators.annotation.session import Scan, Session
 from operators.pointmap import VoxelMap, find_ground, height_above, prepare
 
 EVERY = 10  # frames; the overlap needs no more
@@ -55,45 +55,50 @@ def targets_reached(path: npt.NDArray[Any], targets: npt.NDArray[Any], radius: f
     return reached
 
 
-def overlap(voxels: VoxelMap, session: Session, angular_radius: float = 1.5 * math.radians(1.33)) -> float:
-    """Return the share of the points above the floor that lie within 0.1 m of a point of the map.
+def known_points(voxels: VoxelMap, scan: Scan, angular_radius: float) -> tuple[int, int]:
+    """Count the points of a frame above the floor, and those of them within 0.1 m of a point of the map.
 
-    Every tenth frame is looked at, subsampled by 0.1 m. 0 for a session without such points.
+    The frame is subsampled by 0.1 m. angular_radius: of the neighbourhoods of its normals, radians.
     """
-    seen, known = 0, 0
-    for number in range(0, len(session), EVERY):
-        scan = session[number]
-        frame = prepare(scan.points, voxel_size=0.1, angular_radius=angular_radius)
-        if not len(frame.points):
-            continue
-        world, normals = frame.moved(scan.world_from_lidar)
-        plane = find_ground(world, normals)
-        heights = world[:, 2] if plane is None else height_above(plane, world)
-        above = world[heights > ABOVE]
-        found, _ = voxels.nearest(above, NEAR)
-        seen += len(above)
-        known += int((found >= 0).sum())
-    return known / seen if seen else 0.0
+    frame = prepare(scan.points, voxel_size=0.1, angular_radius=angular_radius)
+    if not len(frame.points):
+        return 0, 0
+    world, normals = frame.moved(scan.world_from_lidar)
+    plane = find_ground(world, normals)
+    heights = world[:, 2] if plane is None else height_above(plane, world)
+    above = world[heights > ABOVE]
+    found, _ = voxels.nearest(above, NEAR)
+    return len(above), int((found >= 0).sum())
 
 
 def gather_evidence(
-    session: Session, voxels: VoxelMap, targets: npt.NDArray[Any] | None = None, radius: float = 0.9
+    session: Session,
+    voxels: VoxelMap,
+    targets: npt.NDArray[Any] | None = None,
+    radius: float = 0.9,
+    angular_radius: float = 1.5 * math.radians(1.33),
 ) -> Evidence:
-    """Look at a session's poses and at what it saw. targets: (k, 2) world, metres, or None where there were none."""
-    path, invalid, inliers = np.zeros((len(session), 2)), 0, np.zeros(len(session))
-    for number in range(len(session)):
-        scan = session[number]
-        path[number] = scan.world_from_lidar[:2, 3]
+    """Look at a session's poses and at what each tenth frame saw.
+
+    targets: (k, 2) world, metres; NaN for those that the robot was never given; None where there were none.
+    """
+    path, inliers = np.zeros((len(session), 2)), np.zeros(len(session))
+    frames, invalid, seen, known = 0, 0, 0, 0
+    for scan in session:
+        path[frames], inliers[frames] = scan.world_from_lidar[:2, 3], scan.inliers
         invalid += not scan.valid
-        inliers[number] = scan.inliers
+        if frames % EVERY == 0:
+            counts = known_points(voxels, scan, angular_radius)
+            seen, known = seen + counts[0], known + counts[1]
+        frames += 1
     wanted = np.zeros((0, 2)) if targets is None else np.asarray(targets, np.float64)
     return Evidence(
-        frames=len(session),
+        frames=frames,
         targets=len(wanted),
-        reached=targets_reached(path, wanted, radius),
+        reached=targets_reached(path[:frames], wanted, radius),
         invalid=invalid,
-        inliers=float(np.median(inliers)) if len(session) else 0.0,
-        overlap=overlap(voxels, session),
+        inliers=float(np.median(inliers[:frames])) if frames else 0.0,
+        overlap=known / seen if seen else 0.0,
     )
 
 

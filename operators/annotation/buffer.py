@@ -48,8 +48,7 @@ class Buffer(NamedTuple):
 def fill_buffer(refined: MapPoints, session: Session, settings: MapSettings | None = None) -> PointMap:
     """Map all valid frames of a session at their own poses on top of the refined map; no new alignment."""
     pointmap = PointMap(settings, initial=refined)
-    for number in range(len(session)):
-        scan = session[number]
+    for scan in session:
         if scan.valid:
             pointmap.enter(pointmap.prepare(scan.points), scan.world_from_lidar)
     return pointmap
@@ -68,8 +67,7 @@ def trace_new(news: MapPoints, session: Session, rays: RaySettings) -> Floats:
     voxels = VoxelMap()
     order = voxels.insert_map(news)
     tracer = PointRay(voxels, rays)
-    for number in range(len(session)):
-        scan = session[number]
+    for scan in session:
         if scan.valid:
             tracer.add(scan.points, scan.world_from_lidar)
     movable = np.full(len(news.points), 0.5, np.float32)

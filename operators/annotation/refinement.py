@@ -22,13 +22,12 @@ class Refinement(NamedTuple):
     clearance: float = 0.10
 
 
-def movable_in(cloud: MapPoints, session: Session, rays: RaySettings) -> tuple[Floats, npt.NDArray[np.int32]]:
+def trace_map(cloud: MapPoints, session: Session, rays: RaySettings) -> tuple[Floats, npt.NDArray[np.int32]]:
     """Return movable probability and looks (n,) of the points of a map by the valid frames of one session."""
     voxels = VoxelMap()
     order = voxels.insert_map(cloud)
     tracer = PointRay(voxels, rays)
-    for number in range(len(session)):
-        scan = session[number]
+    for scan in session:
         if scan.valid:
             tracer.add(scan.points, scan.world_from_lidar)
     movable, looks = np.full(len(cloud.points), 0.5, np.float32), np.zeros(len(cloud.points), np.int32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -23,13 +24,16 @@ class Scan(NamedTuple):
     world_from_lidar: Matrix  # (4, 4)
     valid: bool = True  # whether the localizer believed its pose
     inliers: float = 1.0  # share of its samples that found their plane in the map
+    odom_from_base: Matrix | None = None  # (4, 4), for those who align anew
+    base_from_lidar: Matrix | None = None  # (4, 4)
 
 
 class Session(Protocol):
-    """Frames by number; they may be read from a file each time they are asked for."""
+    """Frames in their order; they may be read from a file each time they are iterated over."""
 
-    name: str
+    @property
+    def name(self) -> str: ...
 
     def __len__(self) -> int: ...
 
-    def __getitem__(self, number: int) -> Scan: ...
+    def __iter__(self) -> Iterator[Scan]: ...
