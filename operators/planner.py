@@ -1,8 +1,16 @@
-"""Drive to the goal: plan on the map and on what is seen, choose velocities ten times a second."""
+"""Drive to the goal: plan on the map and on what is seen, choose velocities ten times a second.
+
+planner:
+  run: operators.planner:Planner
+  inputs: {goal: simulator/goal, map: localizer/occupancy, obstacles: triage/planning, tracks: tracker/tracks,
+    pose: localizer/pose}
+  config: {people: predict}
+"""
 
 from __future__ import annotations
 
 from collections import deque
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -12,8 +20,10 @@ from graph.geometry import Matrix, interpolate, planar
 from graph.messages import Drive, Goal, OccupancyGrid, Plan, PointCloud, Pose
 from operators.navigation.footprint import Footprint
 from operators.navigation.navigator import Navigator
+from operators.navigation.people import NOBODY, Walkers
 from operators.navigation.window import Limits
 from operators.pointmap.rehearsal import room_scan
+from operators.tracker import Tracks
 
 HISTORY = 50  # poses kept, to find where a frame was taken
 WAITING = 10  # frames kept until the pose of their time is known
@@ -37,6 +47,9 @@ class Planner(Operator):
         window: float = 4.0  # metres, side of the square in which velocities are judged
         horizon: float = 3.0  # seconds that they are followed
         latency: float = 0.1  # seconds from a measurement to the effect of the command that answers it
+        people: Literal["ignore", "predict"] = (
+            "ignore"  # those whom a tracker follows: trust them to step aside, or not
+        )
 
     class Outputs(msgspec.Struct):
         """What to do and what for."""
@@ -58,17 +71,28 @@ class Planner(Operator):
         )
         self._poses: deque[tuple[int, Matrix]] = deque(maxlen=HISTORY)
         self._frames: deque[PointCloud] = deque(maxlen=WAITING)
+        self._tracks: Tracks | None = None
 
     @classmethod
     def warm_up(cls) -> None:
         """Plan twice in a made-up room."""
-        rehearsed = cls()
+        rehearsed = cls(cls.Config(people="predict"))
         mount = planar(0.0, 0.0, 0.0, 0.64)
         cells = np.zeros((160, 160), np.int8)
         rehearsed.on_goal(Goal(measured_at=0, target=np.array([2.0, 1.0]), index=0, count=1))
         rehearsed.on_map(OccupancyGrid(measured_at=0, cells=cells, origin=np.array([-4.0, -4.0]), resolution=0.05))
         for stamp in (0, 100_000_000):
             rehearsed.on_obstacles(PointCloud(measured_at=stamp, points=room_scan(), base_from_lidar=mount))
+            walker = np.array([[1.0, 0.5]])
+            rehearsed.on_tracks(
+                Tracks(
+                    measured_at=stamp,
+                    identity=np.ones(1, np.int32),
+                    position=walker,
+                    velocity=-walker,
+                    unseen=np.zeros(1, np.float32),
+                )
+            )
             rehearsed.on_pose(Pose(measured_at=stamp, world_from_base=np.eye(4)))
 
     def on_goal(self, goal: Goal) -> None:
@@ -80,6 +104,9 @@ class Planner(Operator):
     def on_obstacles(self, frame: PointCloud) -> None:
         self._frames.append(frame)
 
+    def on_tracks(self, tracks: Tracks | None) -> None:
+        self._tracks = tracks
+
     def on_pose(self, pose: Pose) -> Outputs:
         self._poses.append((pose.measured_at, pose.world_from_base))
         while self._frames and self._frames[0].measured_at <= pose.measured_at:
@@ -87,6 +114,8 @@ class Planner(Operator):
             where = self._pose_at(frame.measured_at)
             if where is not None:
                 self.navigator.observe(frame.points, where, frame.base_from_lidar)
+        if self.config.people == "predict":
+            self.navigator.meet(self._walkers(pose.measured_at))
         decision = self.navigator.step(pose.measured_at, pose.world_from_base, valid=pose.valid)
         drive = Drive(measured_at=pose.measured_at, linear=decision.twist.linear, angular=decision.twist.angular)
         plan = Plan(
@@ -96,6 +125,14 @@ class Planner(Operator):
             status=decision.status,
         )
         return self.Outputs(drive=drive, plan=plan)
+
+    def _walkers(self, time: int) -> Walkers:
+        """Return the people (k, 4) that are followed, at the moment when the command for a pose takes effect."""
+        if self._tracks is None:
+            return NOBODY
+        seconds = (time - self._tracks.measured_at) * 1e-9 + self.config.latency
+        places = self._tracks.position + seconds * self._tracks.velocity
+        return np.concatenate([places, self._tracks.velocity], axis=1)
 
     def _pose_at(self, time: int) -> Matrix | None:
         """Return world_from_base at a time within the history, between its neighbours; None before its first."""

@@ -14,6 +14,7 @@ from operators.navigation.costmap import CELL, COARSE, FREE, Costmap
 from operators.navigation.footprint import Footprint, Surroundings
 from operators.navigation.lattice import Lattice
 from operators.navigation.motion import Commands, Twist, towards
+from operators.navigation.people import NOBODY, Walkers
 from operators.navigation.search import UNIT, UNREACHED, Field, cost_to_go, trace
 from operators.navigation.window import STEP, DynamicWindow, Limits, way_around
 
@@ -97,6 +98,7 @@ class Navigator:
         self._attempts = 0
         self._attempt_place = (0.0, 0.0)
         self._given_up = 0  # periods left of not trying
+        self._walkers = NOBODY
 
     def set_goal(self, x: float, y: float) -> None:
         """Drive to a place (metres, world) from now on."""
@@ -114,6 +116,10 @@ class Navigator:
     def observe(self, points: npt.NDArray[np.float32], world_from_base: Matrix, base_from_lidar: Matrix) -> None:
         """Enter a frame: points (n, 3) in the lidar frame, and where the base was when it was taken."""
         self.costmap.observe(points, world_from_base @ base_from_lidar, float(world_from_base[2, 3]))
+
+    def meet(self, walkers: Walkers) -> None:
+        """Keep clear of people (k, 4) from now on: x, y, metres and m/s, world, when a command takes effect."""
+        self._walkers = walkers
 
     def step(self, measured_at: int, world_from_base: Matrix, *, valid: bool = True) -> Decision:
         """Decide what to do from a pose measured at a time in nanoseconds; drive carefully when it is not valid."""
@@ -165,7 +171,7 @@ class Navigator:
         seconds_per_cost = self._field_lattice.resolution / (FREE * UNIT) / self.limits.speed
         way = way_around(self._field, self._field_lattice, pose[0], pose[1], self._side, seconds_per_cost)
         top_speed = min(top_speed, math.sqrt(2.0 * self.limits.acceleration * left))  # so as to stop at the goal
-        choice = self.window.choose(pose, self.commands.latest, around, way, top_speed=top_speed)
+        choice = self.window.choose(pose, self.commands.latest, around, way, top_speed=top_speed, walkers=self._walkers)
         return choice.target, "follow", choice.trajectory
 
     def _search(self, pose: Planar) -> None:

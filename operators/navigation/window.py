@@ -17,6 +17,7 @@ from numba import njit
 from operators.navigation.footprint import Body, Footprint, Surroundings, room
 from operators.navigation.lattice import Lattice
 from operators.navigation.motion import Twist, advance, towards
+from operators.navigation.people import NOBODY, Walkers, nearby, toll
 from operators.navigation.search import UNREACHED, Field
 
 STEP = 0.1  # seconds between the poses of an arc: one period of the controller
@@ -28,6 +29,8 @@ TURN_COST = 1.3  # of the time that a turn towards the way takes: above 1, or th
 SWERVE_COST = 0.05  # seconds for each rad/s that the turn differs from the last choice: no dithering between equals
 REVERSE_COST = 1.0  # seconds a second: the robot sees backwards as well, but is not meant to drive so
 NOWHERE = 1e3  # seconds left from where no way leads to the goal
+EVADING = 0.6  # m/s backwards, to get out of somebody's way
+WALKERS_WITHIN = 5.0  # metres: what both can walk and drive in 2 s
 LOOK_AHEAD = 6  # cells of the search that the way is followed to find its direction
 
 
@@ -120,8 +123,10 @@ def _roll(
     around: Surroundings,
     body: Body,
     padding: float,
+    walkers: Walkers,
+    tolls: npt.NDArray[np.float64],
 ) -> int:
-    """Fill in poses (steps + 1, 3), speeds, turns and rooms (steps + 1,); return the last step before a touch."""
+    """Fill in poses (steps + 1, 3) and the rest (steps + 1,); return the last step before a touch."""
     speed, turn = speeds[0], turns[0]
     for k in range(1, len(poses)):
         speed = towards(speed, wanted[0], limits.acceleration * STEP)
@@ -132,6 +137,10 @@ def _roll(
         rooms[k] = room(around, body, COMFORT, x, y, yaw)
         if rooms[k] < padding:
             return k - 1
+        if len(walkers):
+            tolls[k], into = toll(walkers, body.circumscribed, k * STEP, x, y, yaw, speed, limits.speed)
+            if into:
+                return k - 1
     return len(poses) - 1
 
 
@@ -141,6 +150,7 @@ def _judge(
     speeds: npt.NDArray[np.float64],
     turns: npt.NDArray[np.float64],
     rooms: npt.NDArray[np.float64],
+    tolls: npt.NDArray[np.float64],
     free: int,
     limits: Limits,
     way: Way,
@@ -154,7 +164,7 @@ def _judge(
     for k in range(1, free + 1):
         pace = abs(speeds[k])
         to_touch -= pace * STEP
-        spent += STEP
+        spent += STEP + STEP * tolls[k]
         if rooms[k] < COMFORT:
             closeness = (COMFORT - rooms[k]) / COMFORT
             haste = max(0.0, pace / (CREEP + SPEED_PER_ROOM * rooms[k]) - 1.0)
@@ -196,9 +206,10 @@ def _choose(
     body: Body,
     padding: float,
     way: Way,
+    walkers: Walkers,
 ) -> tuple[float, float, float, npt.NDArray[np.float64]]:
     poses = np.empty((steps + 1, 3))
-    speeds, turns, rooms = np.empty(steps + 1), np.empty(steps + 1), np.empty(steps + 1)
+    speeds, turns, rooms, tolls = np.empty(steps + 1), np.empty(steps + 1), np.empty(steps + 1), np.zeros(steps + 1)
     poses[0, 0], poses[0, 1], poses[0, 2] = start
     speeds[0], turns[0] = speed_now, turn_now
     here = room(around, body, COMFORT, start[0], start[1], start[2])
@@ -208,8 +219,8 @@ def _choose(
     for i in range(len(speeds_wanted)):
         for j in range(len(turns_wanted)):
             wanted = (speeds_wanted[i], turns_wanted[j])
-            free = _roll(poses, speeds, turns, rooms, wanted, limits, around, body, needed)
-            total, at = _judge(poses, speeds, turns, rooms, free, limits, way)
+            free = _roll(poses, speeds, turns, rooms, wanted, limits, around, body, needed, walkers, tolls)
+            total, at = _judge(poses, speeds, turns, rooms, tolls, free, limits, way)
             total += SWERVE_COST * abs(turns_wanted[j] - turn_before)
             if total < best:
                 best, best_speed, best_turn = total, wanted[0], wanted[1]
@@ -239,17 +250,30 @@ class DynamicWindow:
         self._turn_before = 0.0
 
     def choose(
-        self, pose: tuple[float, float, float], now: Twist, around: Surroundings, way: Way, *, top_speed: float
+        self,
+        pose: tuple[float, float, float],
+        now: Twist,
+        around: Surroundings,
+        way: Way,
+        *,
+        top_speed: float,
+        walkers: Walkers = NOBODY,
     ) -> Choice:
-        """Choose velocities to aim for, for the robot at a pose (x, y, yaw) that drives at `now`; top_speed in m/s."""
+        """Choose velocities to aim for, for the robot at a pose (x, y, yaw) that drives at `now`.
+
+        top_speed in m/s. walkers: people (k, 4) to keep clear of, at the moment of the pose.
+        """
         speeds, turns = self._samples
-        reverse = -min(self.limits.reverse, top_speed)
+        reverse = [-min(self.limits.reverse, top_speed)]
+        walkers = nearby(walkers, pose[0], pose[1], WALKERS_WITHIN)
+        if len(walkers):  # who comes towards the robot is faster than it backs off otherwise
+            reverse.append(-min(EVADING, top_speed))
         best, speed, turn, trajectory = _choose(
             pose,
             now.linear,
             now.angular,
             self._turn_before,
-            np.concatenate([[reverse], np.linspace(0.0, top_speed, speeds)]),
+            np.concatenate([reverse, np.linspace(0.0, top_speed, speeds)]),
             np.linspace(-self.limits.turn, self.limits.turn, turns),
             self.steps,
             self.limits,
@@ -257,6 +281,7 @@ class DynamicWindow:
             self._body,
             self.padding,
             way,
+            walkers,
         )
         self._turn_before = turn
         return Choice(Twist(speed, turn), trajectory, best)
