@@ -12,7 +12,7 @@ from graph.geometry import planar, transform
 from operators.pointmap.angles import spherical
 from operators.pointmap.eigen import smallest_direction
 from operators.pointmap.frame import prepare
-from operators.pointmap.normals import bin_directions, estimate_normals, trust
+from operators.pointmap.normals import bin_directions, decay, estimate_normals, trust
 from operators.pointmap.voxels import central_points
 
 RADIUS = 1.5 * np.radians(1.33)
@@ -87,7 +87,7 @@ def test_normals_are_those_of_all_neighbours_and_azimuth_wraps():
     seam = np.flatnonzero(np.abs(phi) > np.pi - 0.01)
     chosen = np.concatenate([random.choice(len(points), 60), random.choice(seam, 30)]).astype(np.int32)
     normals, scores, planarities = estimate_normals(x, y, z, rho, theta, phi, chosen, RADIUS)
-    for normal, score, planarity, i in zip(normals, scores, planarities, chosen, strict=True):
+    for normal, score, planarity, i in zip(normals.T, scores, planarities, chosen, strict=True):
         near = points[twin_of_neighbours(points, i)].astype(np.float64)
         values, vectors = np.linalg.eigh(np.cov(near.T, bias=True))
         wanted = vectors[:, 0] * -np.sign(vectors[:, 0] @ points[i])
@@ -98,14 +98,21 @@ def test_normals_are_those_of_all_neighbours_and_azimuth_wraps():
         assert normal @ points[i] <= 0
 
 
-def test_bins_hold_every_point_once():
-    random = np.random.default_rng(3)
-    theta = random.uniform(-0.5, 0.2, 4000).astype(np.float32)
-    phi = random.uniform(-np.pi, np.pi, 4000).astype(np.float32)
-    bins = bin_directions(theta, phi, RADIUS)
-    assert sorted(bins.order) == list(range(4000))
+def test_bins_hold_every_point_once_in_the_order_of_directions():
+    points = np.random.default_rng(3).normal(size=(4000, 3)).astype(np.float32)
+    x, y, z = columns(points)
+    bins = bin_directions(x, y, z, *spherical(x, y, z), RADIUS)
+    assert sorted(map(tuple, bins.points[:, :3])) == sorted(map(tuple, points))
+    row = (bins.points[:, 4] - bins.lowest) // bins.height
+    column = (bins.points[:, 5] + np.pi) // bins.width
+    number = np.repeat(np.arange(bins.rows * bins.columns), np.diff(bins.first))
     assert bins.first[-1] == 4000
-    assert (np.diff(bins.first) >= 0).all()
+    assert (row * bins.columns + column == number).mean() > 0.999  # a few lie on an edge, in single precision
+
+
+def test_decay_is_the_exponential():
+    for u in (0.0, 1e-6, 0.3, 1.0, 7.5, 1e4):
+        assert decay(u) == pytest.approx(np.exp(-u), rel=1e-6, abs=1e-30)
 
 
 def test_the_score_is_that_of_the_authors_code():

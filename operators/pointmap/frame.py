@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from graph.geometry import Matrix, transform
+from graph.geometry import Matrix
 from operators.pointmap.angles import spherical
-from operators.pointmap.normals import estimate_normals
+from operators.pointmap.normals import decay, estimate_normals
 from operators.pointmap.voxels import central_points
 
 Floats = npt.NDArray[np.float32]
@@ -32,9 +31,20 @@ class Frame(NamedTuple):
 
     def moved(self, world_from_lidar: Matrix) -> tuple[Floats, Floats]:
         """Return points and normals, each (m, 3), in the world."""
-        turn = np.eye(4)
-        turn[:3, :3] = world_from_lidar[:3, :3]
-        return transform(world_from_lidar, self.points), transform(turn, self.normals)
+        return carried(np.ascontiguousarray(world_from_lidar, np.float64), self.points, self.normals)
+
+
+@njit(cache=True, error_model="numpy")
+def carried(pose: npt.NDArray[np.float64], points: Floats, normals: Floats) -> tuple[Floats, Floats]:
+    """Return points moved and normals turned by a pose (4, 4), each (m, 3)."""
+    moved, turned = np.empty_like(points), np.empty_like(normals)
+    for n in range(len(points)):
+        x, y, z = float(points[n, 0]), float(points[n, 1]), float(points[n, 2])
+        u, v, w = float(normals[n, 0]), float(normals[n, 1]), float(normals[n, 2])
+        for axis in range(3):
+            moved[n, axis] = pose[axis, 0] * x + pose[axis, 1] * y + pose[axis, 2] * z + pose[axis, 3]
+            turned[n, axis] = pose[axis, 0] * u + pose[axis, 1] * v + pose[axis, 2] * w
+    return moved, turned
 
 
 @njit(cache=True, error_model="numpy")
@@ -56,7 +66,7 @@ def separate(points: Floats) -> tuple[Floats, Floats, Floats, npt.NDArray[np.int
 @njit(cache=True, error_model="numpy")
 def sampling_weight(planarity: float, rho: float) -> float:
     """Return the weight of a point in the random sampling: planar and far points first."""
-    return planarity * (1.5 - math.exp(-((rho / 5.0) ** 2)))
+    return planarity * (1.5 - decay(rho * rho / 25.0))
 
 
 @njit(cache=True, error_model="numpy")
@@ -71,10 +81,10 @@ def gather(
     scores: Floats,
     planarities: Floats,
 ) -> tuple[Floats, Floats, Floats, Floats, npt.NDArray[np.int32]]:
-    """Collect what is trusted of the chosen points, in their order, into the fields of a Frame."""
+    """Collect what is trusted of the chosen points, in their order, into the fields of a Frame. normals: (3, m)."""
     most = len(chosen)
-    points = np.empty((most, 3), np.float32)
-    weights = np.empty(most, np.float32)
+    points, turned = np.empty((most, 3), np.float32), np.empty((most, 3), np.float32)
+    trusted, weights = np.empty(most, np.float32), np.empty(most, np.float32)
     indices = np.empty(most, np.int32)
     found = 0
     for k in range(most):
@@ -82,13 +92,12 @@ def gather(
             continue
         i = chosen[k]
         points[found, 0], points[found, 1], points[found, 2] = x[i], y[i], z[i]
-        for axis in range(3):
-            normals[found, axis] = normals[k, axis]
-        scores[found] = scores[k]
-        weights[found] = sampling_weight(planarities[k], rho[i])
+        turned[found, 0], turned[found, 1], turned[found, 2] = normals[0, k], normals[1, k], normals[2, k]
+        trusted[found] = scores[k]
+        weights[found] = sampling_weight(float(planarities[k]), float(rho[i]))
         indices[found] = kept[i]
         found += 1
-    return points[:found], normals[:found], scores[:found], weights[:found], indices[:found]
+    return points[:found], turned[:found], trusted[:found], weights[:found], indices[:found]
 
 
 def prepare(points: npt.NDArray[Any], *, voxel_size: float, angular_radius: float) -> Frame:

@@ -12,6 +12,7 @@ from numba import njit
 from operators.pointmap.draw import State, alias_table, sample
 from operators.pointmap.frame import Frame
 from operators.pointmap.nearest import nearest
+from operators.pointmap.prefetch import prefetch
 from operators.pointmap.store import NONE, NORMAL, SCORE, Store
 
 Doubles = npt.NDArray[np.float64]
@@ -142,6 +143,8 @@ def step(
             world_points[n, axis] = turned_points[n, axis] + pose[axis, 3]
     matches, _ = nearest(store, voxel, world_points, reach)
     rows = store.rows
+    for n in range(count):
+        prefetch(rows, matches[n])
     pairs, error, total = 0, 0.0, 0.0
     for n in range(count):
         match = matches[n]

@@ -34,43 +34,57 @@ def spread(key: int, mask: int) -> int:
 
 
 @njit(cache=True, error_model="numpy")
+def voxel_keys(x: Floats, y: Floats, z: Floats, size: float, keys: npt.NDArray[np.int64], offsets: Floats) -> None:
+    """Write the key of each point's voxel, and its squared distance in voxels from the centre, both (n,)."""
+    per = 1.0 / size
+    for i in range(len(x)):
+        u, v, w = x[i] * per, y[i] * per, z[i] * per
+        fu, fv, fw = math.floor(u), math.floor(v), math.floor(w)
+        keys[i] = pack(int(fu), int(fv), int(fw))
+        du, dv, dw = u - fu - 0.5, v - fv - 0.5, w - fw - 0.5
+        offsets[i] = du * du + dv * dv + dw * dw
+
+
+@njit(cache=True, error_model="numpy")
+def first_visits(keys: npt.NDArray[np.int64], offsets: Floats) -> npt.NDArray[np.int32]:
+    """Return, for each different key by first visit, the index of its smallest offset; of two equal ones the first."""
+    table = np.full(1 << 12, -1, np.int32)  # slot to position in `chosen`; small tables stay in the cache
+    mask = len(table) - 1
+    chosen = np.empty(len(keys), np.int32)
+    found, place = 0, 0
+    last_key = np.int64(-1)
+    for i in range(len(keys)):
+        key = keys[i]
+        if key != last_key:  # neighbours in a scan mostly share their voxel
+            last_key = key
+            slot = spread(key, mask)
+            while table[slot] != -1 and keys[chosen[table[slot]]] != key:
+                slot = (slot + 1) & mask
+            if table[slot] == -1:
+                place = found
+                table[slot] = place
+                chosen[place] = i
+                found += 1
+                if 2 * found > mask:
+                    table = np.full(4 * len(table), -1, np.int32)
+                    mask = len(table) - 1
+                    for old in range(found):
+                        slot = spread(keys[chosen[old]], mask)
+                        while table[slot] != -1:
+                            slot = (slot + 1) & mask
+                        table[slot] = old
+                continue
+            place = table[slot]
+        if offsets[i] < offsets[chosen[place]]:
+            chosen[place] = i
+    return chosen[:found].copy()
+
+
 def central_points(x: Floats, y: Floats, z: Floats, size: float) -> npt.NDArray[np.int32]:
     """Return the indices (m,) of the point nearest the centre of each voxel of `size` metres, by first visit.
 
     Of two points equally near the first stays.
     """
-    count = len(x)
-    slots = 1 << 12
-    while slots < 2 * count:
-        slots *= 2
-    mask = slots - 1
-    keys = np.full(slots, -1, np.int64)
-    places = np.empty(slots, np.int32)  # slot to position in `chosen`
-    chosen = np.empty(count, np.int32)
-    offsets = np.empty(count, np.float64)  # squared, in voxels
-    found = 0
-    last_key, place = -1, 0
-    for i in range(count):
-        u, v, w = x[i] / size, y[i] / size, z[i] / size
-        fu, fv, fw = math.floor(u), math.floor(v), math.floor(w)
-        key = pack(int(fu), int(fv), int(fw))
-        du, dv, dw = u - fu - 0.5, v - fv - 0.5, w - fw - 0.5
-        offset = du * du + dv * dv + dw * dw
-        if key != last_key:  # neighbours in a scan mostly share their voxel
-            last_key = key
-            slot = spread(key, mask)
-            while keys[slot] != key and keys[slot] != -1:
-                slot = (slot + 1) & mask
-            if keys[slot] == -1:
-                keys[slot] = key
-                places[slot] = found
-                chosen[found] = i
-                offsets[found] = offset
-                place = found
-                found += 1
-                continue
-            place = places[slot]
-        if offset < offsets[place]:
-            offsets[place] = offset
-            chosen[place] = i
-    return chosen[:found].copy()
+    keys, offsets = np.empty(len(x), np.int64), np.empty(len(x), np.float32)
+    voxel_keys(x, y, z, size, keys, offsets)
+    return first_visits(keys, offsets)
