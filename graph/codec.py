@@ -57,7 +57,10 @@ def _pack_array(value: Any) -> Any:
     raise CodecError(f"a {type(value).__name__} cannot travel in a message")
 
 
-def _encode(message: msgspec.Struct) -> bytes:
+Room = Callable[[int], memoryview | None]  # memory for so many bytes, where there is any
+
+
+def _encode(message: msgspec.Struct, room: Room | None) -> bytes | memoryview:
     """Encode a message, copying large arrays once instead of three times; the bytes are the same."""
     large: list[tuple[bytes, memoryview]] = []
 
@@ -68,15 +71,26 @@ def _encode(message: msgspec.Struct) -> bytes:
         return _pack_array(value)
 
     encoded = msgspec.msgpack.encode(message, enc_hook=pack, order="deterministic")
-    if not large:
-        return encoded
-    between = encoded.split(_PLACE_BYTES)
+    between = encoded.split(_PLACE_BYTES) if large else [encoded]
     if len(between) != len(large) + 1:  # the message happens to hold the bytes of a place holder
-        return msgspec.msgpack.encode(message, enc_hook=_pack_array, order="deterministic")
+        between = [msgspec.msgpack.encode(message, enc_hook=_pack_array, order="deterministic")]
+        large.clear()
     pieces: list[bytes | memoryview] = [between[0]]
     for (head, data), rest in zip(large, between[1:], strict=True):
         pieces += (_EXT_32.pack(0xC9, len(head) + data.nbytes, ARRAY_EXTENSION), head, data, rest)
-    return b"".join(pieces)
+    size = sum(piece.nbytes if isinstance(piece, memoryview) else len(piece) for piece in pieces)
+    target = None if room is None else room(size)
+    return b"".join(pieces) if target is None else _filled(target, pieces)
+
+
+def _filled(target: memoryview, pieces: list[bytes | memoryview]) -> memoryview:
+    """Copy pieces behind each other into memory of just their size."""
+    begin = 0
+    for piece in pieces:
+        flat = piece.cast("B") if isinstance(piece, memoryview) else piece
+        target[begin : begin + len(flat)] = flat
+        begin += len(flat)
+    return target
 
 
 _head_decoder = msgspec.msgpack.Decoder(tuple[str, tuple[int, ...]])
@@ -166,12 +180,19 @@ def struct_checks(kind: type[Any]) -> tuple[tuple[str, Check], ...]:
 
 def encode(message: msgspec.Struct) -> bytes:
     """Encode a message. Raises CodecError, naming the field, if an array is not of the declared dtype and shape."""
+    encoded = encode_into(message, None)
+    assert isinstance(encoded, bytes)
+    return encoded
+
+
+def encode_into(message: msgspec.Struct, room: Room | None) -> bytes | memoryview:
+    """Encode a message into the memory that `room` has for it, or else into new bytes. Raises as `encode`."""
     try:
         _check_struct(message, {}, type(message).__name__)
     except (TypeError, AttributeError) as error:
         raise CodecError(f"{type(message).__name__}: {error}") from error
     try:
-        return _encode(message)
+        return _encode(message, room)
     except (TypeError, ValueError, msgspec.MsgspecError) as error:
         raise CodecError(f"{type(message).__name__}: {error}") from error
 
@@ -194,7 +215,7 @@ def decode(payload: bytes | memoryview, kind: type[msgspec.Struct]) -> Any:
     return message
 
 
-def digest(payload: bytes) -> bytes:
+def digest(payload: bytes | memoryview) -> bytes:
     """Return the 16-byte xxh3-128 digest of a payload."""
     return xxhash.xxh3_128_digest(payload)
 

@@ -23,15 +23,17 @@ from graph.graphfile import Graph
 from graph.lockstep import endless
 from graph.merge import merge
 from graph.recording import Verdict
+from graph.ring import reserve, retire
 from graph.run import Paths, describe
 from graph.status import StatusLine
 from graph.threads import environment
 from graph.transport import Sample, Wire, free_port
 from graph.wiring import NodeSpec, wire
-from graph.words import Boot, Control, State
+from graph.words import Boot, Control, SharedRing, State
 
 DRAIN = 5.0  # seconds that a stopped run gets to come to rest
 LEAVE = 10.0  # seconds that a process gets to write its footer and go
+LOOPBACK = "127.0.0.1"  # elsewhere others may listen, and the payloads go over the wire
 POLL = 0.05  # seconds between two looks at the children
 SILENCE = 0.3  # realtime: seconds without news after which a stopped run whose counts agree is at rest
 
@@ -44,6 +46,15 @@ class Outcome(msgspec.Struct):
     sim_seconds: float
     wall_seconds: float
     states: dict[str, Any]  # operator: steps, p50_ms, p95_ms, skipped
+
+
+def reserve_rings(specs: list[NodeSpec]) -> dict[str, SharedRing]:
+    """Reserve a ring for each topic that somebody listens to."""
+    readers: dict[str, list[str]] = {}
+    for spec in specs:
+        for topic in dict.fromkeys(edge.topic for edge in spec.inputs if edge.period is None):
+            readers.setdefault(topic, []).append(spec.name)
+    return {topic: SharedRing(reserve(len(names)), tuple(names)) for topic, names in readers.items()}
 
 
 class Child:
@@ -59,6 +70,7 @@ class Child:
             stderr=subprocess.STDOUT,
             env={**os.environ, **environment(threads), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
             start_new_session=True,  # Ctrl-C is for the launcher alone
+            pass_fds=[ring.descriptor for ring in boot.rings.values()],
         )
         assert self.process.stdin is not None
         assert self.process.stdout is not None
@@ -97,7 +109,7 @@ class Launcher:
         graph: Graph,
         *,
         record: Path | None = None,
-        host: str = "127.0.0.1",
+        host: str = LOOPBACK,
         log_level: str = "warning",
         command: str = "",
         quiet: bool = False,
@@ -119,13 +131,16 @@ class Launcher:
         self.reasons: list[str] = []
         self.interrupts = 0
         self.realtime = graph.clock.mode == "realtime"
+        self.rings = reserve_rings(self.specs) if host == LOOPBACK else {}
 
     # processes
 
     def spawn(self, spec: NodeSpec, incarnation: int = 0) -> None:
         """Start one operator's process."""
         shard = self.paths.shards / f"{spec.name}.{incarnation}.mcap"
-        boot = Boot(spec, self.endpoint, self.prefix, str(shard), incarnation, self.log_level)
+        mine = {f"{spec.name}/{port}" for port in spec.outputs} | {edge.topic for edge in spec.inputs}
+        rings = {topic: ring for topic, ring in self.rings.items() if topic in mine}
+        boot = Boot(spec, self.endpoint, self.prefix, str(shard), incarnation, self.log_level, rings)
         self.shards.append(shard)
         self.children[spec.name] = Child(boot, spec.threads, self.paths.shards / f"{spec.name}.log", self.status.say)
 
@@ -168,6 +183,9 @@ class Launcher:
             how = f"{name} {_ending(code)}"
             if child.spec.kind == "sink":
                 self.status.say(f"{how}; the run goes on without it")
+                for ring in self.rings.values():
+                    if name in ring.readers:
+                        retire(ring.descriptor, ring.readers.index(name))
                 del self.children[name]
             elif self.realtime and child.spec.restart == "on-failure" and name in self.ready and not self.stopping:
                 self.status.say(f"{how}; starting it again")
@@ -209,6 +227,8 @@ class Launcher:
             signal.signal(signal.SIGINT, before)
             signal.signal(signal.SIGTERM, terminate)
             self.status.close()
+            for ring in self.rings.values():
+                os.close(ring.descriptor)
 
     def _start(self) -> None:
         """Start all processes; nothing begins before every one has declared its ports."""

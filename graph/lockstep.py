@@ -31,7 +31,7 @@ class Arrival(NamedTuple):
     port: int  # index into the inputs
     sequence: int
     incarnation: int
-    payload: bytes | None  # None for a tick, and for an item of a source
+    payload: bytes | memoryview | None  # None for a tick, and for an item of a source
     skipped: tuple[Skip, ...] = ()
     late: bool = False
 
@@ -81,7 +81,7 @@ class Lockstep:
         self.stream_stamp = -1 if self.streaming else INFINITY  # nothing below comes from the own stream
         self.promised = -1
 
-    def deliver(self, topic: str, incarnation: int, sequence: int, stamp: int, payload: bytes) -> None:
+    def deliver(self, topic: str, incarnation: int, sequence: int, stamp: int, payload: bytes | memoryview) -> None:
         """Take a message off the wire. Raises GapError if one before it is missing."""
         for edge in self.edges:
             if edge.edge.topic != topic:
@@ -107,7 +107,7 @@ class Lockstep:
         if operator in self.flow:
             self.flow[operator] = max(self.flow[operator], watermark)
 
-    def offer(self, stamp: int, payload: bytes | None = None) -> None:
+    def offer(self, stamp: int, payload: bytes | memoryview | None = None) -> None:
         """Queue the next item of a source's stream; INFINITY: there are no more, which ends a run that it is to end."""
         if not self.streaming:
             return  # a person stopped the run

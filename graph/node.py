@@ -10,12 +10,13 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from graph.codec import decode, digest, encode
+from graph.codec import decode, digest, encode_into
 from graph.contract import End, Operator, Source, Summary, ports_of
 from graph.ledger import Emitted, Ref, Skip, Step
 from graph.loading import build_config, load_class
 from graph.lockstep import Arrival
 from graph.messages import Tick
+from graph.ring import LARGE, RingWriter
 from graph.wiring import NodeSpec
 
 START, END, STREAM = "start", "end", "stream"
@@ -27,7 +28,8 @@ class Emission(NamedTuple):
     port: str
     sequence: int
     stamp: int
-    payload: bytes
+    payload: bytes | memoryview
+    place: int | None = None  # in the ring of its topic
 
 
 class OutputError(TypeError):
@@ -53,12 +55,15 @@ def build_operator(spec: NodeSpec) -> Operator:
 class Node:
     """Runs the calls of one operator; owns its sequences and its step index, and nothing about time."""
 
-    def __init__(self, spec: NodeSpec, operator: Operator, incarnation: int = 0) -> None:
+    def __init__(
+        self, spec: NodeSpec, operator: Operator, incarnation: int = 0, rings: dict[str, RingWriter] | None = None
+    ) -> None:
         self.spec, self.operator, self.incarnation = spec, operator, incarnation
         ports = ports_of(type(operator))
         self.input_types, self.output_types = ports.inputs, ports.outputs
         self.handlers = {port: getattr(operator, f"on_{port}") for port in ports.inputs}
         self.counts = dict.fromkeys(ports.outputs, 0)
+        self.rings = rings or {}  # by output port
         self.index = 0
         self.summary: Summary | None = None
         self.stream: Iterator[tuple[int, Any]] | None = None
@@ -105,7 +110,7 @@ class Node:
         self,
         port: str,
         ref: Ref,
-        payload: bytes | None,
+        payload: bytes | memoryview | None,
         stamp: int,
         emit: Emit,
         *,
@@ -140,9 +145,9 @@ class Node:
             if isinstance(item, End):
                 ended = item.reason
                 continue
-            for name, sequence, payload in self._messages(item, port):
-                emitted.append(Emitted(name, sequence, digest(payload)))
-                emit(Emission(name, sequence, stamp, payload))
+            for emission in self._messages(item, port, stamp):
+                emitted.append(Emitted(emission.port, emission.sequence, digest(emission.payload)))
+                emit(emission)
         step = Step(
             self.index,
             port,
@@ -172,7 +177,7 @@ class Node:
         else:
             raise OutputError(self._complaint(result, port))
 
-    def _messages(self, outputs: Any, port: str) -> Iterator[tuple[str, int, bytes]]:
+    def _messages(self, outputs: Any, port: str, stamp: int) -> Iterator[Emission]:
         if not isinstance(outputs, self.operator.Outputs):
             raise OutputError(self._complaint(outputs, port))
         for name, kind in self.output_types.items():
@@ -185,7 +190,20 @@ class Node:
                 )
             sequence = self.counts[name]
             self.counts[name] = sequence + 1
-            yield name, sequence, encode(message)
+            yield Emission(name, sequence, stamp, *self._encoded(name, message))
+
+    def _encoded(self, port: str, message: msgspec.Struct) -> tuple[bytes | memoryview, int | None]:
+        """Encode a message where its readers find it: return the payload, and its place if that is in the ring."""
+        ring, place = self.rings.get(port), None
+
+        def room(size: int) -> memoryview | None:
+            nonlocal place
+            if ring is None or size < LARGE or (found := ring.allocate(size)) is None:
+                return None
+            place, memory = found
+            return memory
+
+        return encode_into(message, room), place
 
     def _complaint(self, given: Any, port: str) -> str:
         wanted = "Outputs, End, None or an iterator of them" + (", or a Summary" if port == END else "")

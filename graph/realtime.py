@@ -26,7 +26,7 @@ class Realtime:
         self.handled = 0
         self.stopped = False  # timers and sources give nothing more
 
-    def deliver(self, topic: str, incarnation: int, sequence: int, stamp: int, payload: bytes) -> None:
+    def deliver(self, topic: str, incarnation: int, sequence: int, stamp: int, payload: bytes | memoryview) -> None:
         """Take a message off the wire; a full queue gives up its oldest."""
         self.received[topic] += 1
         for port, edge in enumerate(self.spec.inputs):

@@ -299,8 +299,8 @@ class _Run:
             key = (f"{item.spec.name}/{emission.port}", incarnation, emission.sequence)
             if key in said or (emission.port, emission.sequence) not in digests:
                 continue
-            self._hold(key, emission.payload)
-            said[key] = emission.payload
+            said[key] = bytes(emission.payload)
+            self._hold(key, said[key])
             if item.tainted or item.report.first is not None:
                 self.diverged.add(key)
 

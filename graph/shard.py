@@ -1,6 +1,7 @@
 """A shard: what one operator process emitted and did, written where it was born.
 
-Unchunked MCAP, flushed after each call, so that a killed process loses at most the call it was in.
+Unchunked MCAP, flushed after each call, so that a killed process loses at most the call it was in, and the one before
+if that spoke at length and its messages are still on their way to their readers.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from graph.node import Emission
 from graph.wiring import NodeSpec
 
 STEP, SUMMARY = "step", "summary"  # topics beside an operator's own ports: operator/step, operator/summary
+
+MUCH = 1 << 18  # bytes that take longer to write than a message takes to travel
 
 LEDGER_SCHEMA = "retracer.Step"
 SUMMARY_SCHEMA = "retracer.Summary"
@@ -57,6 +60,7 @@ class Shard:
         self.writer.start(profile="retracer-shard", library="retracer")
         mine = {"operator": spec.name, "incarnation": str(incarnation)}
         self.channels: dict[str, int] = {}
+        self.held: tuple[list[Emission], Step, Summary | dict[str, object] | None] | None = None
         for port, (name, text) in schemas.items():
             number = self.writer.register_schema(name, "jsonschema", text.encode())
             self.channels[port] = self.writer.register_channel(f"{spec.name}/{port}", "msgpack", number, mine)
@@ -66,6 +70,19 @@ class Shard:
         self.channels[SUMMARY] = self.writer.register_channel(f"{spec.name}/{SUMMARY}", "msgpack", number, mine)
         self.writer.add_metadata("retracer.shard", mine)  # the writer holds schemas and channels back until this
         self.stream.flush()
+
+    def hold(self, emissions: list[Emission], step: Step, summary: Summary | dict[str, object] | None = None) -> None:
+        """Write what a call said and did, at once if that is little, else when `settle` is called."""
+        self.settle()
+        self.held = emissions, step, summary
+        if sum(len(emission.payload) for emission in emissions) < MUCH:
+            self.settle()
+
+    def settle(self) -> None:
+        """Write what is held back."""
+        if self.held is not None:
+            held, self.held = self.held, None
+            self.write(*held)
 
     def write(
         self, emissions: Iterable[Emission], step: Step, summary: Summary | dict[str, object] | None = None
@@ -79,6 +96,7 @@ class Shard:
 
     def leave(self, emissions: Iterable[Emission]) -> None:
         """Append messages alone: those of a call that failed after it had spoken."""
+        self.settle()
         self._messages(emissions)
         self.stream.flush()
 
@@ -87,13 +105,14 @@ class Shard:
             if self.spec.record[emission.port] == "full":
                 self._add(emission.port, emission.stamp, emission.sequence, emission.payload)
 
-    def _add(self, port: str, stamp: int, sequence: int, data: bytes) -> None:
+    def _add(self, port: str, stamp: int, sequence: int, data: bytes | memoryview) -> None:
         # what Writer.add_message writes, without its two copies of the data
         length = _FIELDS + len(data)
         self.stream.write(_RECORD.pack(Opcode.MESSAGE, length, self.channels[port], sequence, stamp, stamp))
         self.stream.write(data)
 
     def close(self) -> None:
-        """Write the footer."""
+        """Write what is left and the footer."""
+        self.settle()
         self.writer.finish()  # type: ignore[no-untyped-call]
         self.stream.close()

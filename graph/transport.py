@@ -2,7 +2,7 @@
 
 The launcher holds the router; operators are clients. What keeps Zenoh from losing messages silently: BLOCK instead of
 DROP, a lease and a wait_before_close longer than any stall that we tolerate, and one priority for all, so that data
-is never overtaken by the mark that announces it.
+is never overtaken by the mark that announces it. Its own shared memory stays off: large payloads lie in a ring.
 """
 
 from __future__ import annotations
@@ -16,18 +16,19 @@ from typing import NamedTuple, Self
 import msgspec
 import zenoh
 
-STALL = 30  # seconds that a stuck reader may take before its transport is closed
-POOL = 16 << 20  # bytes of shared memory for the large messages of one process
-LARGE = 1 << 15  # bytes of a message that goes through it; smaller ones fit a packet
+from graph.ring import RingReader
 
-_ENVELOPE = struct.Struct("<IQq")  # incarnation, sequence, stamp
+STALL = 30  # seconds that a stuck reader may take before its transport is closed
+INLINE = -1  # the place of a payload that travels with its message
+
+_ENVELOPE = struct.Struct("<IQqqI")  # incarnation, sequence, stamp; place in the ring and length
 
 
 class Sample(NamedTuple):
     """What came in: data (`data/op/port`), a mark, a state, a control word; or a liveliness change."""
 
     key: str
-    payload: bytes
+    payload: bytes | memoryview
     envelope: tuple[int, int, int]  # incarnation, sequence, stamp; zeros where there is none
     alive: bool = True
     mark: bytes = b""  # the mark that travels with the last messages of a call
@@ -47,9 +48,7 @@ def _configuration(mode: str, endpoint: str) -> zenoh.Config:
         "scouting/multicast/enabled": "false",
         "scouting/gossip/enabled": "false",
         ("listen" if mode == "router" else "connect") + "/endpoints": f'["{endpoint}"]',
-        "transport/shared_memory/enabled": "true",
-        "transport/shared_memory/mode": '"init"',
-        "transport/shared_memory/transport_optimization/enabled": "false",  # it copies twice; Wire.put does it once
+        "transport/shared_memory/enabled": "false",  # it takes longer, and a process that begins can clear it away
         "transport/link/tx/lease": str(STALL * 1000),
         "transport/link/tx/queue/congestion_control/block/wait_before_close": str(STALL * 1_000_000),
     }
@@ -70,7 +69,6 @@ class Wire:
         self.inbox: queue.SimpleQueue[Sample] = queue.SimpleQueue()
         self.publishers: dict[str, zenoh.Publisher] = {}
         self.tokens: list[zenoh.LivelinessToken] = []
-        self.pool: zenoh.shm.ShmProvider | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -84,24 +82,27 @@ class Wire:
         """Close the session; without it Zenoh's threads keep the process alive."""
         self.session.close()  # type: ignore[no-untyped-call]
 
-    def _receiver(self, key: str) -> zenoh.handlers.Callback[zenoh.Sample]:
+    def _receiver(self, key: str, ring: RingReader | None = None) -> zenoh.handlers.Callback[zenoh.Sample]:
         """Return a handler; it runs in a thread of Zenoh, so it does little. A key without wildcards is known ahead."""
         known = None if "*" in key else key
         skip, put = len(self.prefix) + 1, self.inbox.put
 
         def receive(sample: zenoh.Sample) -> None:
-            envelope, mark = (0, 0, 0), b""
+            envelope, mark, place, length = (0, 0, 0), b"", INLINE, 0
             if (attachment := sample.attachment) is not None:
                 raw = attachment.to_bytes()
-                envelope, mark = _ENVELOPE.unpack_from(raw), raw[_ENVELOPE.size :]
+                incarnation, sequence, stamp, place, length = _ENVELOPE.unpack_from(raw)
+                envelope = incarnation, sequence, stamp
+                mark = raw[_ENVELOPE.size :]
             name = known or str(sample.key_expr)[skip:]
-            put(Sample(name, sample.payload.to_bytes(), envelope, sample.kind == zenoh.SampleKind.PUT, mark))
+            payload = sample.payload.to_bytes() if place == INLINE or ring is None else ring.read(place, length)
+            put(Sample(name, payload, envelope, sample.kind == zenoh.SampleKind.PUT, mark))
 
         return zenoh.handlers.Callback(receive, indirect=False)
 
-    def subscribe(self, key: str) -> None:
-        """Let everything put under a key (wildcards allowed) come into the inbox."""
-        self.session.declare_subscriber(f"{self.prefix}/{key}", self._receiver(key))
+    def subscribe(self, key: str, ring: RingReader | None = None) -> None:
+        """Let everything put under a key (wildcards allowed) come into the inbox, large payloads from the ring."""
+        self.session.declare_subscriber(f"{self.prefix}/{key}", self._receiver(key, ring))
 
     def watch(self, key: str) -> None:
         """Let liveliness tokens, present and future, come into the inbox."""
@@ -120,23 +121,19 @@ class Wire:
             express=True,
         )
 
-    def put(self, key: str, payload: bytes, envelope: tuple[int, int, int] | None = None, mark: bytes = b"") -> None:
-        """Put bytes; blocks while the way is full."""
+    def put(
+        self,
+        key: str,
+        payload: bytes | memoryview,
+        envelope: tuple[int, int, int] | None = None,
+        mark: bytes = b"",
+        place: int = INLINE,
+    ) -> None:
+        """Put bytes, or say where in the ring they lie; blocks while the way is full."""
         if key not in self.publishers:
             self.announce(key)
-        attachment = None if envelope is None else _ENVELOPE.pack(*envelope) + mark
-        self.publishers[key].put(payload if len(payload) < LARGE else self._shared(payload), attachment=attachment)
-
-    def _shared(self, payload: bytes) -> bytes | zenoh.shm.ZShmMut:
-        """Copy a payload into shared memory; as it is where there is none, or readers still hold all of it."""
-        try:
-            if self.pool is None:
-                self.pool = zenoh.shm.ShmProvider.default_backend(POOL)
-            buffer = self.pool.alloc(len(payload), zenoh.shm.GarbageCollect())
-            buffer[:] = payload
-        except zenoh.ZError:
-            return payload
-        return buffer
+        attachment = None if envelope is None else _ENVELOPE.pack(*envelope, place, len(payload)) + mark
+        self.publishers[key].put(payload if place == INLINE else b"", attachment=attachment)
 
     def tell(self, key: str, record: msgspec.Struct) -> None:
         """Put one of the runtime's own records."""

@@ -8,7 +8,14 @@ import msgspec
 
 from graph.wiring import NodeSpec
 
-Phase = Literal["running", "paused", "idle", "finished"]
+Phase = Literal["running", "paused", "idle", "ending", "finished"]
+
+
+class SharedRing(msgspec.Struct, frozen=True):
+    """The ring of one topic, as a process inherits it."""
+
+    descriptor: int
+    readers: tuple[str, ...]  # operators, in the order of their counters
 
 
 class Boot(msgspec.Struct):
@@ -20,6 +27,7 @@ class Boot(msgspec.Struct):
     shard: str
     incarnation: int = 0
     log_level: str = "warning"
+    rings: dict[str, SharedRing] = {}  # by topic; none where others than our processes listen
 
 
 class Control(msgspec.Struct):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
 import os
 import queue
@@ -17,16 +16,20 @@ import msgspec
 
 from graph.errors import UserError
 from graph.ledger import INFINITY, Mark, Step
+from graph.lifeline import outlive_nobody, read_boot
 from graph.lockstep import GapError, Lockstep
 from graph.memory import keep_pages, spare_garbage_collection
 from graph.node import STREAM, Emission, Node, build_operator
 from graph.realtime import Realtime
+from graph.ring import RingReader, RingWriter
 from graph.shard import Shard, schemas_of
 from graph.threads import set_threads
-from graph.transport import Sample, Wire
+from graph.transport import INLINE, Sample, Wire
 from graph.words import Boot, Control, Phase, State
 
 GAP_PATIENCE = 5.0  # seconds of the consumer's own running time
+LAST = b"last"  # the mark of what an operator says in realtime when the run is over
+REST = 1e-3  # seconds that a large message gets to reach its readers before the disk gets it; both take the cores
 STATE_PERIOD = 0.1  # seconds between two reports to the launcher
 FLOW_PARTS = 4  # a consumer reports its watermark upstream each quarter of `ahead`
 
@@ -37,7 +40,12 @@ class Worker:
     def __init__(self, boot: Boot, wire: Wire) -> None:
         self.boot, self.wire, self.spec = boot, wire, boot.spec
         set_threads(self.spec.threads)
-        self.node = Node(self.spec, build_operator(self.spec), boot.incarnation)
+        rings = {
+            topic.partition("/")[2]: RingWriter(ring.descriptor, len(ring.readers))
+            for topic, ring in boot.rings.items()
+            if topic.partition("/")[0] == self.spec.name
+        }
+        self.node = Node(self.spec, build_operator(self.spec), boot.incarnation, rings)
         set_threads(self.spec.threads)
         self.shard = Shard(Path(boot.shard), self.spec, schemas_of(self.node.output_types), boot.incarnation)
         self.lockstep = Lockstep(self.spec) if self.spec.mode == "lockstep" and self.spec.kind != "sink" else None
@@ -51,6 +59,8 @@ class Worker:
         self.flowed = -1
         self.durations: list[int] = []
         self.skipped = 0
+        self.last_words: list[Sample] = []
+        self.taken_leave = False
         self.own_end: int | None = None
         self.reported: tuple[object, ...] = ()
         self.report_at = 0.0
@@ -62,7 +72,7 @@ class Worker:
         spec, wire = self.spec, self.wire
         wire.subscribe("control")
         for topic in dict.fromkeys(edge.topic for edge in spec.inputs if edge.period is None):
-            wire.subscribe(f"data/{topic}")
+            wire.subscribe(f"data/{topic}", self._ring(topic))
         if self.lockstep is not None:
             listened = [*spec.producers, *([spec.end] if spec.end not in (None, spec.name) else [])]
             for name in dict.fromkeys(listened):
@@ -78,6 +88,12 @@ class Worker:
             threading.Thread(target=self._pull, daemon=True).start()
         spare_garbage_collection()
         wire.declare_ready(spec.name)
+
+    def _ring(self, topic: str) -> RingReader | None:
+        if (ring := self.boot.rings.get(topic)) is None:
+            return None
+        copy = self.spec.kind == "sink"  # a slow one shall not keep the memory that the others need
+        return RingReader(ring.descriptor, len(ring.readers), ring.readers.index(self.spec.name), copy=copy)
 
     # what comes in
 
@@ -99,7 +115,12 @@ class Worker:
         inbox = self.wire.inbox
         if timeout and inbox.empty():
             try:
-                self._take(inbox.get(timeout=timeout))
+                first = inbox.get(timeout=min(timeout, REST)) if self.shard.held else None
+            except queue.Empty:
+                self.shard.settle()
+                first = None
+            try:
+                self._take(first or inbox.get(timeout=timeout))
             except queue.Empty:
                 return False
         elif inbox.empty():
@@ -111,6 +132,9 @@ class Worker:
     def _take(self, sample: Sample) -> None:
         kind, _, rest = sample.key.partition("/")
         if kind == "data":
+            if sample.mark == LAST and self.spec.kind != "sink" and not self.taken_leave:
+                self.last_words.append(sample)
+                return
             incarnation, sequence, stamp = sample.envelope
             schedule = self.lockstep or self.realtime
             assert schedule is not None
@@ -160,15 +184,16 @@ class Worker:
         """
         if self.lockstep is None and self.spec.restart == "on-failure":
             self.shard.leave([emission])
-            self._put(emission)
+            self._put(emission, LAST if self.phase == "ending" else b"")
             return
         if self.lockstep is None:
-            self._put(emission)
+            self._put(emission, LAST if self.phase == "ending" else b"")
         self.emissions.append(emission)
 
     def _put(self, emission: Emission, mark: bytes = b"") -> None:
         envelope = (self.boot.incarnation, emission.sequence, emission.stamp)
-        self.wire.put(f"data/{self.spec.name}/{emission.port}", emission.payload, envelope, mark)
+        place = INLINE if emission.place is None else emission.place
+        self.wire.put(f"data/{self.spec.name}/{emission.port}", emission.payload, envelope, mark, place)
 
     def promise(self) -> None:
         """Put what the call emitted, and tell the neighbours how far this operator is, if that has changed."""
@@ -190,8 +215,8 @@ class Worker:
         if self.lockstep is not None:
             self.promise()
         summary, self.node.summary = self.node.summary, None
-        self.shard.write(self.emissions, step, summary)
-        self.emissions.clear()
+        self.shard.hold(self.emissions, step, summary)
+        self.emissions = []
         self.durations.append(step.wall_duration)
         self.skipped += len(step.skipped)
 
@@ -261,12 +286,14 @@ class Worker:
                     self.pace(arrival.time)
                 if self.leaving:
                     return
+                self.shard.settle()
                 step = node.handle(arrival, arrival.time, self.emit)
                 if step.port == STREAM:
                     self.demand.release()
                 if step.ended is not None and self.spec.end == self.spec.name:
                     schedule.finish_at(arrival.time)
                 self.after(step)
+                del arrival  # its payload makes room in the ring
                 self.report()
                 continue
             if schedule.complete() and self.phase == "running":
@@ -280,6 +307,7 @@ class Worker:
                     raise GapError(f"{self.spec.name}: never came: {', '.join(schedule.gaps())}")
         if self.leaving:
             return
+        self.shard.settle()
         step = node.finish(schedule.end, self.emit)
         schedule.finished = True
         self.after(step)
@@ -313,6 +341,7 @@ class Worker:
                 self.drain(min(max((schedule.wake() - now) / 1e9, 1e-4), 0.05))
                 continue
             self.phase = "running"
+            self.shard.settle()
             step = node.handle(arrival, arrival.time, self.emit)
             if step.port == STREAM:
                 self.demand.release()
@@ -325,37 +354,18 @@ class Worker:
         if self.spec.kind == "sink":
             while (arrival := schedule.next(time.monotonic_ns() - origin)) is not None:
                 self.after(node.handle(arrival, arrival.time, self.emit))
+        self.shard.settle()
+        self.phase = "ending"
         last = node.finish(schedule.handled, self.emit, schedule.leave())
         self.phase = "finished"
         self.report(force=True)
         while not self.leaving:
             self.drain(1.0)
-        late = schedule.leave("end")  # what others said in their on_end
+        self.taken_leave = True
+        for sample in self.last_words:  # what others said in their on_end
+            self._take(sample)
+        late = schedule.leave("end")
         self.after(msgspec.structs.replace(last, skipped=last.skipped + late))
-
-
-def _outlive_nobody() -> None:
-    """End this process when the launcher is gone, even if that was killed: its end of our stdin closes."""
-
-    def watch() -> None:
-        while os.read(0, 1):
-            pass
-        os._exit(3)
-
-    if sys.platform == "linux":  # also while a long call of native code holds the interpreter
-        ctypes.CDLL(None, use_errno=True).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def read_boot() -> Boot:
-    """Read the one line that the launcher writes, unbuffered, so that the pipe can be watched afterwards."""
-    line = bytearray()
-    while not line.endswith(b"\n"):
-        byte = os.read(0, 65536)
-        if not byte:
-            raise SystemExit(3)
-        line += byte
-    return msgspec.json.decode(line, type=Boot)
 
 
 def main() -> int:
@@ -363,7 +373,7 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the launcher
     keep_pages()
     boot = read_boot()
-    _outlive_nobody()
+    outlive_nobody()
     logging.basicConfig(level=boot.log_level.upper(), format="%(levelname)s %(name)s: %(message)s")
     try:
         with Wire(boot.endpoint, boot.prefix) as wire:
