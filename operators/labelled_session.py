@@ -2,7 +2,7 @@
 
 annotator:
   run: operators.labelled_session:LabelledSession
-  config: {session: recordings/run.mcap, buffer: annotated/buffers/run.ply}
+  config: {session: recordings/run.mcap, map: annotated/map.ply, buffer: annotated/buffers/run.ply}
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import numpy as np
 from graph.contract import End, Source, Summary
 from graph.geometry import inverse, transform
 from graph.messages import PointCloud, Pose
+from operators.annotation.files import load_buffer, shared_map
 from operators.annotation.projection import Projector
 from operators.annotation.tally import Tally
-from operators.pointmap import load_map
 from operators.recorded_session import RecordedSession, load_poses
 
 
@@ -33,7 +33,8 @@ class LabelledSession(Source):
         """The session and its annotation."""
 
         session: Path
-        buffer: Path  # PLY with classes
+        map: Path  # the refined one, PLY
+        buffer: Path  # what the session saw besides, PLY with classes
         every: int = 1
         frames: str | None = None  # topic
         poses: Path | None = None  # of `save_poses`; None: those that the session's localizer said
@@ -51,7 +52,7 @@ class LabelledSession(Source):
         c = self.config
         self.tally = Tally()
         session = RecordedSession(c.session, frames=c.frames, known=None if c.poses is None else load_poses(c.poses))
-        projector = Projector(load_map(c.buffer))
+        projector = Projector(load_buffer(c.buffer, shared_map(c.map)))
         pending: tuple[int, Any] | None = None
         for cloud, scan in session.clouds(every=c.every):
             if not scan.valid:

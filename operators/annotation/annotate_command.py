@@ -18,13 +18,14 @@ from graph.codec import digest
 from graph.errors import UserError
 from graph.status import progress_bar
 from operators.annotation.acceptance import Acceptance
-from operators.annotation.buffer import Classing
+from operators.annotation.buffer import Classing, ground_or
 from operators.annotation.crew_command import crew
 from operators.annotation.refinement import Refinement, refine
 from operators.annotation.report import write_report
-from operators.annotation.stages_command import Examined, Job, examine, label, probabilities
+from operators.annotation.session import PERMANENT
+from operators.annotation.stages_command import Examined, Job, examine, label, probabilities, shared_cloud
 from operators.annotation.tally import by_truth, measures, moved_doors
-from operators.pointmap import MapPoints, PlyError, load_map, save_map
+from operators.pointmap import PlyError, save_map
 
 LABELLED = ".labelled.mcap"
 
@@ -83,7 +84,7 @@ def job_of(args: argparse.Namespace) -> Job:
     return Job(
         sessions=tuple(path.resolve() for path in args.sessions),
         map=args.map.resolve(),
-        map_digest=read_map(args.map)[1],
+        map_digest=check_map(args.map),
         output=args.output.resolve(),
         every=args.every,
         frames=args.frames,
@@ -96,14 +97,16 @@ def job_of(args: argparse.Namespace) -> Job:
     )
 
 
-def read_map(path: Path) -> tuple[MapPoints, str]:
-    """Read a map and the digest of its file. Raises UserError for one that will not do."""
+def check_map(path: Path) -> str:
+    """Read a map and return the digest of its file. Raises UserError for one that will not do."""
     try:
-        return load_map(path), digest(path.read_bytes()).hex()
+        found = digest(path.read_bytes()).hex()
+        shared_cloud(path.resolve(), found)
     except PlyError as error:
         raise UserError(str(error)) from None
     except OSError as error:
         raise UserError(f"{path}: {error.strerror}; `retracer map` makes a map") from None
+    return found
 
 
 def annotate(job: Job, args: argparse.Namespace) -> dict[str, Any]:
@@ -128,18 +131,19 @@ def annotate(job: Job, args: argparse.Namespace) -> dict[str, Any]:
         paths = [path for path, one in zip(job.sessions, examined, strict=True) if one.accepted]
         labelled = list(all_of(label, refined, paths, lambda share: progress(0.45 + 0.5 * share)))
         told = outcome(job, examined, labelled, gone)
-        write_report(job.output / "report.html", told, load_map(job.map), load_map(refined.map), job.buffers)
+        before = shared_cloud(job.map, job.map_digest)[0]
+        write_report(job.output / "report.html", told, before, np.load(job.work / "stays.npy"), job.buffers)
     (job.output / "report.json").write_text(json.dumps(told, indent=2) + "\n")
     return told
 
 
 def refined_map(job: Job, accepted: list[Examined]) -> tuple[Job, dict[str, Any]]:
     """Drop from the map what accepted sessions saw through. Returns the job of the second stage, and what went."""
-    cloud, _ = read_map(job.map)
+    cloud, _ = shared_cloud(job.map, job.map_digest)
     movable = [probabilities(job, one, len(cloud.points)) for one in accepted]
     refined, stays = refine(cloud, movable, job.refinement)
     path = job.output / "map.ply"
-    save_map(path, refined)
+    save_map(path, refined._replace(label=ground_or(refined, PERMANENT, job.classing)[0]))
     gone = {"points": len(cloud.points), "gone": int((~stays).sum()), "map": str(path)}
     np.save(job.work / "stays.npy", stays)
     return job.refined(path, digest(path.read_bytes()).hex()), gone

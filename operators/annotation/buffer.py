@@ -1,12 +1,17 @@
-"""The buffer map of a session, its movable probabilities and its classes (paper section III-C, steps 3 to 5)."""
+"""The buffer map of a session, its movable probabilities and its classes (paper section III-C, steps 3 to 5).
+
+A buffer is the refined map, which is permanent or ground, and what the session saw besides. The two are kept apart:
+only the new points are traced and classified, and the known ones, a hundred times as many, are shared by all sessions.
+"""
 
 from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from operators.annotation.floor import floor_points
+from operators.annotation.floor import Booleans, floor_points
 from operators.annotation.session import (
     GROUND,
     LONG_TERM,
@@ -17,7 +22,7 @@ from operators.annotation.session import (
     Labels,
     Session,
 )
-from operators.pointmap import MapPoints, PointMap, VoxelMap, find_ground
+from operators.pointmap import MapPoints, PointMap, VoxelMap, find_ground, height_above
 from operators.pointmap import Settings as MapSettings
 from operators.pointray import PointRay, RaySettings
 
@@ -29,6 +34,7 @@ class Classing(NamedTuple):
     long: float = 0.4  # movable below, but not part of the map
     ground: float = 0.05  # metres from the plane; the truth of simulators ends there too
     clearance: float = 0.01
+    apart: float = 0.04  # metres from the known map: what is nearer is the known surface, measured with noise
     permanent: Literal["plane", "ring"] = "plane"  # "ring" as the authors
     ring: float = 0.10  # metres around the map, and around what can move
     thickness: float = 0.04  # metres from the plane of the nearest permanent point
@@ -36,106 +42,141 @@ class Classing(NamedTuple):
     steps: int = 4
 
 
-class Buffer(NamedTuple):
-    """The map of one session: what was known before, then what the session saw besides."""
+class KnownMap(NamedTuple):
+    """A refined map, ready to be searched."""
 
     voxels: VoxelMap
-    known: int  # points of the refined map, the first ones
-    movable: Floats  # (n,) probability; 0 for the known
-    labels: Labels  # (n,)
+    labels: Labels  # (n,) permanent or ground
+    plane: npt.NDArray[np.float64] | None  # (a, b, c) of the ground
 
 
-def fill_buffer(refined: MapPoints, session: Session, settings: MapSettings | None = None) -> PointMap:
-    """Map all valid frames of a session at their own poses on top of the refined map; no new alignment."""
-    pointmap = PointMap(settings, initial=refined)
-    for scan in session:
+def known_map(cloud: MapPoints, settings: Classing | None = None, voxel: float = 0.03) -> KnownMap:
+    """Prepare a refined map: everything in it is permanent or ground."""
+    settings = Classing() if settings is None else settings
+    voxels = VoxelMap(voxel)
+    voxels.insert(cloud.points, cloud.normals, cloud.scores, -1)
+    return KnownMap(voxels, *ground_or(voxels.cloud(), PERMANENT, settings))
+
+
+def ground_or(
+    cloud: MapPoints, other: int, settings: Classing, plane: npt.NDArray[np.float64] | None = None
+) -> tuple[Labels, npt.NDArray[np.float64] | None]:
+    """Return a class (n,) for points near the ground, another for all others, and the plane of the ground."""
+    labels = np.full(len(cloud.points), other, np.uint8)
+    plane = find_ground(cloud.points, cloud.normals) if plane is None else plane
+    if plane is not None:
+        labels[floor_points(cloud.points, plane, settings.ground, settings.clearance)] = GROUND
+    return labels, plane
+
+
+class Buffer(NamedTuple):
+    """The map of one session: what was known before, and what the session saw besides."""
+
+    known: KnownMap
+    known_labels: Labels  # (n,)
+    new: MapPoints  # with movable and label
+
+
+def new_points(
+    known: VoxelMap, session: Session, settings: MapSettings | None = None, apart: float = Classing().apart
+) -> VoxelMap:
+    """Map the valid frames of a session at their own poses, without new alignment, `apart` metres from the known map."""
+    pointmap = PointMap(settings)
+    for number, scan in enumerate(session):
         if scan.valid:
-            pointmap.enter(pointmap.prepare(scan.points), scan.world_from_lidar)
-    return pointmap
+            enter_new(pointmap, known, scan.points, scan.world_from_lidar, number, apart)
+    return pointmap.map
 
 
-def new_points(pointmap: PointMap) -> MapPoints:
-    """Return the points that the session added to the refined map."""
-    return pointmap.map.cloud().kept(pointmap.map.created >= 0)
+def enter_new(
+    pointmap: PointMap,
+    known: VoxelMap,
+    points: npt.NDArray[np.float32],
+    world_from_lidar: npt.NDArray[np.float64],
+    number: int,
+    apart: float,
+) -> None:
+    """Add to a map those subsampled points of a frame (n, 3) that the known map does not have."""
+    frame = pointmap.prepare(points)
+    world, normals = frame.moved(world_from_lidar)
+    found, _ = known.nearest(world, apart)
+    fresh = np.flatnonzero(found < 0)
+    pointmap.map.insert(world[fresh], normals[fresh], frame.scores[fresh], number)
 
 
-def trace_new(news: MapPoints, session: Session, rays: RaySettings) -> Floats:
-    """Return the movable probabilities (n,) of the new points, by the frames of their own session.
+def trace_new(new: VoxelMap, session: Session, rays: RaySettings) -> Floats:
+    """Return the movable probabilities (k,) of the new points, by the frames of their own session.
 
     The known points need none: they are permanent or ground. To leave them out makes the tracing several times faster.
     """
-    voxels = VoxelMap()
-    order = voxels.insert_map(news)
-    tracer = PointRay(voxels, rays)
+    tracer = PointRay(new, rays)
     for scan in session:
         if scan.valid:
             tracer.add(scan.points, scan.world_from_lidar)
-    movable = np.full(len(news.points), 0.5, np.float32)
-    movable[order] = tracer.movable()
-    return movable
+    return tracer.movable()
 
 
-def classify(pointmap: PointMap, news_movable: Floats, settings: Classing | None = None) -> Buffer:
-    """Give each point of a buffer its class, in the order of overwriting: shortT, longT, permanent, ground.
+def classify(known: KnownMap, new: MapPoints, settings: Classing | None = None) -> Buffer:
+    """Give each new point its class, in the order of overwriting: shortT, longT, permanent, ground.
 
-    news_movable: probabilities (k,) of the points that the session added, in their order.
+    new: with movable probabilities. Raises ValueError without them.
     """
     settings = Classing() if settings is None else settings
-    cloud = pointmap.map.cloud()
-    new = pointmap.map.created >= 0
-    movable = np.zeros(len(cloud.points), np.float32)
-    movable[new] = news_movable
-    labels = np.full(len(cloud.points), UNCERTAIN, np.uint8)
-    labels[new & (movable > settings.short)] = SHORT_TERM
-    labels[new & (movable < settings.long)] = LONG_TERM
-    labels[~new] = PERMANENT
-    extend = extend_along_planes if settings.permanent == "plane" else extend_by_ring
-    extend(cloud, labels, new, settings)
-    plane = find_ground(cloud.points, cloud.normals)
-    if plane is not None:
-        labels[floor_points(cloud.points, plane, settings.ground, settings.clearance)] = GROUND
-    return Buffer(pointmap.map, int((~new).sum()), movable, labels)
+    if new.movable is None:
+        raise ValueError("points are classified by their movable probabilities; these have none")
+    labels = np.full(len(new.points), UNCERTAIN, np.uint8)
+    labels[new.movable > settings.short] = SHORT_TERM
+    labels[new.movable < settings.long] = LONG_TERM
+    known_labels = known.labels
+    if settings.permanent == "plane":
+        extend_along_planes(known.voxels, new, labels, settings)
+    else:
+        touched = extend_by_ring(known.voxels, new, labels, settings)
+        known_labels = np.where(touched & (known_labels == PERMANENT), UNCERTAIN, known_labels).astype(np.uint8)
+    if known.plane is not None:
+        floor = np.abs(height_above(known.plane, new.points)) < settings.ground
+        labels[floor] = GROUND
+    return Buffer(known, known_labels, new._replace(label=labels))
 
 
-def subset(cloud: MapPoints, chosen: np.ndarray) -> VoxelMap:
+def subset(cloud: MapPoints, chosen: Booleans) -> VoxelMap:
     """Return a map of the chosen points alone."""
     voxels = VoxelMap()
     voxels.insert(cloud.points[chosen], cloud.normals[chosen], cloud.scores[chosen], 0)
     return voxels
 
 
-def extend_by_ring(cloud: MapPoints, labels: Labels, new: np.ndarray, settings: Classing) -> None:
+def extend_by_ring(known: VoxelMap, new: MapPoints, labels: Labels, settings: Classing) -> Booleans:
     """Call permanent what is new within the ring of the known, but nothing within the ring of what can move.
 
-    As the authors do it. Known points near something movable become uncertain.
+    As the authors do it. Returns which known points (n,) are near something movable: they become uncertain.
     """
-    found, _ = subset(cloud, ~new).nearest(cloud.points, settings.ring)
+    found, _ = known.nearest(new.points, settings.ring)
     near = found >= 0
-    remaining = new & ~near & ((labels == LONG_TERM) | (labels == SHORT_TERM))
-    found, _ = subset(cloud, remaining).nearest(cloud.points, settings.ring)
-    touched = found >= 0
-    labels[near & new & ~touched] = PERMANENT
-    labels[~new & touched] = UNCERTAIN
+    remaining = subset(new, ~near & ((labels == LONG_TERM) | (labels == SHORT_TERM)))
+    found, _ = remaining.nearest(new.points, settings.ring)
+    labels[near & (found < 0)] = PERMANENT
+    found, _ = remaining.nearest(known.points, settings.ring)
+    return found >= 0
 
 
-def extend_along_planes(cloud: MapPoints, labels: Labels, new: np.ndarray, settings: Classing) -> None:
+def extend_along_planes(known: VoxelMap, new: MapPoints, labels: Labels, settings: Classing) -> None:
     """Call permanent what continues the planes of the known: holes in walls close, what stands before them stays out.
 
     A new point that nobody saw through joins when the nearest permanent point is near and its plane passes through the
     point; a few steps close the hole that a cupboard left.
     """
-    candidates = np.flatnonzero(new & (labels != SHORT_TERM))
-    front = ~new
+    candidates = np.flatnonzero(labels != SHORT_TERM)
+    front, points, normals = known, known.points, known.normals
     for _ in range(settings.steps):
-        if not len(candidates) or not front.any():
+        if not len(candidates) or not len(points):
             return
-        chosen = np.flatnonzero(front)
-        found, _ = subset(cloud, front).nearest(cloud.points[candidates], settings.growth)
+        found, _ = front.nearest(new.points[candidates], settings.growth)
         near = found >= 0
-        candidates_near, nearest = candidates[near], chosen[found[near]]
-        apart = (cloud.points[candidates_near] - cloud.points[nearest]) * cloud.normals[nearest]
+        candidates_near, nearest = candidates[near], found[near]
+        apart = (new.points[candidates_near] - points[nearest]) * normals[nearest]
         joins = candidates_near[np.abs(apart.sum(axis=1)) < settings.thickness]
         labels[joins] = PERMANENT
-        front = np.zeros(len(labels), np.bool_)
-        front[joins] = True
+        front = subset(new, np.isin(np.arange(len(labels)), joins))
+        points, normals = front.points, front.normals
         candidates = candidates[labels[candidates] != PERMANENT]

@@ -22,17 +22,13 @@ class Refinement(NamedTuple):
     clearance: float = 0.10
 
 
-def trace_map(cloud: MapPoints, session: Session, rays: RaySettings) -> tuple[Floats, npt.NDArray[np.int32]]:
+def trace_map(voxels: VoxelMap, session: Session, rays: RaySettings) -> tuple[Floats, npt.NDArray[np.int32]]:
     """Return movable probability and looks (n,) of the points of a map by the valid frames of one session."""
-    voxels = VoxelMap()
-    order = voxels.insert_map(cloud)
     tracer = PointRay(voxels, rays)
     for scan in session:
         if scan.valid:
             tracer.add(scan.points, scan.world_from_lidar)
-    movable, looks = np.full(len(cloud.points), 0.5, np.float32), np.zeros(len(cloud.points), np.int32)
-    movable[order], looks[order] = tracer.movable(), tracer.looks()
-    return movable, looks
+    return tracer.movable(), tracer.looks()
 
 
 def refine(

@@ -14,7 +14,8 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from operators.annotation.session import LABELS, Floats
-from operators.pointmap import MapPoints, PlyError, load_map
+from operators.pointmap import MapPoints, PlyError
+from operators.pointmap.ply import read_ply
 
 PIXEL = 0.05  # metres of the pictures from above
 FLOOR = 0.10  # metres: what lies below is drawn under everything
@@ -46,15 +47,20 @@ class Canvas:
         self.low = low - 0.5
         self.columns, self.rows = (int(size) for size in np.ceil((high - low + 1.0) / PIXEL))
 
-    def draw(self, points: Floats, colours: Picture, order: npt.NDArray[Any] | None = None) -> Picture:
-        """Draw points (n, 3) with colours (n, 3): of those on one pixel the one of the highest order, then height."""
-        image = np.full((self.rows, self.columns, 3), 255, np.uint8)
-        cells = np.floor((points[:, :2] - self.low) / PIXEL).astype(np.int64)
+    def draw(
+        self, points: Floats, colours: Picture, rank: npt.NDArray[Any] | None = None, under: Picture | None = None
+    ) -> Picture:
+        """Draw points (n, 3) with colours (n, 3): of those on one pixel the one of the highest rank, then height.
+
+        rank: (n,) in [0, 1]. under: a picture to draw on.
+        """
+        image = np.full((self.rows, self.columns, 3), 255, np.uint8) if under is None else under.copy()
+        cells = np.floor((points[:, :2] - self.low) / PIXEL).astype(np.int32)
         inside = (cells >= 0).all(axis=1) & (cells < (self.columns, self.rows)).all(axis=1)
-        inside &= points[:, 2] < CEILING
-        chosen = np.flatnonzero(inside)
-        rank = np.zeros(len(points)) if order is None else order
-        chosen = chosen[np.lexsort((points[chosen, 2], rank[chosen]))]  # painters paint the foremost last
+        chosen = np.flatnonzero(inside & (points[:, 2] < CEILING))
+        height = np.clip(points[chosen, 2] / CEILING * 255.0, 0.0, 255.0).astype(np.uint16)
+        first = 0 if rank is None else np.clip(rank[chosen] * 255.0, 0.0, 255.0).astype(np.uint16) << 8
+        chosen = chosen[np.argsort(height + first, kind="stable")]  # painters paint the foremost last
         image[self.rows - 1 - cells[chosen, 1], cells[chosen, 0]] = colours[chosen]
         return image
 
@@ -72,19 +78,15 @@ def movable_colours(movable: Floats) -> Picture:
     return np.stack([np.interp(movable, [0.0, 0.5, 1.0], tints[:, axis]) for axis in range(3)], axis=1).astype(np.uint8)
 
 
-def missing(before: MapPoints, after: MapPoints) -> npt.NDArray[np.bool_]:
-    """Say which points of a map (n,) another that was made of it does not have."""
-    kinds = [("x", "f4"), ("y", "f4"), ("z", "f4")]
-    keys = [np.ascontiguousarray(cloud.points).view(kinds).ravel() for cloud in (before, after)]
-    return ~np.isin(keys[0], keys[1])
-
-
-def write_report(path: Path, told: dict[str, Any], before: MapPoints, after: MapPoints, buffers: Path) -> None:
-    """Write the page, pictures inside; it appears whole or not at all."""
-    canvas = Canvas(before.points)
-    gone = missing(before, after)
-    colours = height_colours(before.points[:, 2])
-    colours[gone] = GONE
+def write_report(
+    path: Path, told: dict[str, Any], cloud: MapPoints, stays: npt.NDArray[np.bool_], buffers: Path
+) -> None:
+    """Write the page, pictures inside; it appears whole or not at all. stays: points (n,) of the map that are left."""
+    canvas = Canvas(cloud.points)
+    colours = height_colours(cloud.points[:, 2])
+    after = canvas.draw(cloud.points[stays], colours[stays])
+    colours[~stays] = GONE
+    faint = (255 - (255 - after.astype(np.int64)) // 2).astype(np.uint8)
     parts = [
         "<h1>Annotation</h1>",
         f"<p>{told['frames']} labelled frames of {told['sessions_accepted']} sessions; "
@@ -93,8 +95,8 @@ def write_report(path: Path, told: dict[str, Any], before: MapPoints, after: Map
         *truth_parts(told),
         "<h2>The map, before and after refinement</h2>",
         '<div class="pair">',
-        figure(canvas.draw(before.points, colours, gone), "before: what sessions saw through is red"),
-        figure(canvas.draw(after.points, height_colours(after.points[:, 2])), "after"),
+        figure(canvas.draw(cloud.points, colours, (~stays).astype(np.float32)), "before: what leaves it is red"),
+        figure(after, "after"),
         "</div>",
         "<h2>Sessions</h2>",
         session_table(told),
@@ -103,7 +105,7 @@ def write_report(path: Path, told: dict[str, Any], before: MapPoints, after: Map
     ]
     accepted = [name for name, one in told["sessions"].items() if one["accepted"]]
     for name in accepted[:MOST_BUFFERS]:
-        parts += buffer_parts(name, buffers / f"{name}.ply", canvas)
+        parts += buffer_parts(name, buffers / f"{name}.ply", canvas, faint)
     if len(accepted) > MOST_BUFFERS:
         parts.append(f"<p>{len(accepted) - MOST_BUFFERS} more buffers are in {html.escape(str(buffers))}.</p>")
     page = f"<!doctype html><html><head><meta charset='utf-8'><title>Annotation</title><style>{STYLE}</style></head>"
@@ -112,24 +114,22 @@ def write_report(path: Path, told: dict[str, Any], before: MapPoints, after: Map
     partial.replace(path)
 
 
-def buffer_parts(name: str, path: Path, canvas: Canvas) -> list[str]:
-    """Draw the classes and the movable probabilities of one session's buffer, and count its points."""
+def buffer_parts(name: str, path: Path, canvas: Canvas, known: Picture) -> list[str]:
+    """Draw the classes and the movable probabilities of what one session saw, on the map, and count its points."""
     try:
-        cloud = load_map(path)
+        columns = read_ply(path)
     except (OSError, PlyError) as error:
         return [f"<h3>{html.escape(name)}</h3><p class=no>{html.escape(str(error))}</p>"]
-    assert cloud.label is not None
-    assert cloud.movable is not None
-    rank = np.array([1, 0, 2, 3, 4])[cloud.label]  # what moves is drawn over what stays
-    counts = np.bincount(cloud.label, minlength=len(LABELS))
-    told = ", ".join(f"{label} {count}" for label, count in zip(LABELS, counts.tolist(), strict=True))
+    points = np.stack([columns[axis] for axis in ("x", "y", "z")], axis=1)
+    label, movable = columns["class"], columns["p_mov"]
+    rank = np.array([0.2, 0.0, 0.4, 0.6, 0.8])[label]  # what moves is drawn over what stays
+    counts = np.bincount(label, minlength=len(LABELS)).tolist()
+    told = ", ".join(f"{label} {count}" for label, count in zip(LABELS, counts, strict=True))
     return [
-        f"<h3>{html.escape(name)}</h3><p>Points of the buffer: {told}.</p>",
+        f"<h3>{html.escape(name)}</h3><p>Points besides the map: {told}.</p>",
         '<div class="pair">',
-        figure(canvas.draw(cloud.points, COLOURS[cloud.label], rank), "classes"),
-        figure(
-            canvas.draw(cloud.points, movable_colours(cloud.movable), cloud.movable), "movable probability: red moves"
-        ),
+        figure(canvas.draw(points, COLOURS[label], rank, known), "classes"),
+        figure(canvas.draw(points, movable_colours(movable), movable, known), "movable probability: red moves"),
         "</div>",
     ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import time
 import zipfile
@@ -19,10 +20,11 @@ from graph.inprocess import launch_in_process
 from graph.recording import Recording
 from operators.annotation.acceptance import Acceptance, accept
 from operators.annotation.alignment import align_session
-from operators.annotation.buffer import Classing, classify, fill_buffer, new_points, trace_new
+from operators.annotation.buffer import Classing, classify, new_points, trace_new
+from operators.annotation.files import save_buffer, shared_map
 from operators.annotation.refinement import Refinement, trace_map
 from operators.annotation.session import Floats
-from operators.pointmap import Settings, VoxelMap, load_map, save_map
+from operators.pointmap import MapPoints, Settings, VoxelMap, load_map
 from operators.pointray import RaySettings
 from operators.recorded_session import Known, RecordedSession, load_poses, save_poses
 
@@ -108,26 +110,33 @@ def examine(job: Job, path: Path, tell: Any) -> Examined:
         left.unlink(missing_ok=True)
     begin = time.perf_counter()
     session = open_session(job, path, tell)
-    cloud = load_map(job.map)
+    cloud, voxels = shared_cloud(job.map, job.map_digest)
     if job.align or not session.located:
         aligned, _ = align_session(session, cloud, job.mapping)
         keep_poses(job, path, session, aligned.scans)
         session = open_session(job, path, tell)
-    voxels = VoxelMap()
-    voxels.insert_map(cloud)
     verdict = accept(session, voxels, targets=session.targets, settings=job.acceptance)
-    del voxels
     reasons = verdict.reasons
     if session.without_pose > (1.0 - LEAST_POSES) * max(1, len(session)):
         reasons = (f"{session.without_pose} of its {len(session)} frames have no pose", *reasons)
     evidence: dict[str, Any] = {**verdict.evidence._asdict(), "without_pose": session.without_pose}
     examined = Examined(session.name, not reasons, reasons, evidence, key)
     if examined.accepted:
-        movable, looks = trace_map(cloud, session, job.rays)
+        movable, looks = trace_map(voxels, session, job.rays)
         save_arrays(traces(job, examined), movable=movable, looks=looks)
     evidence["seconds_examined"] = round(time.perf_counter() - begin, 2)
     write_json(verdict_file, examined._asdict())
     return examined
+
+
+@functools.lru_cache(maxsize=1)
+def shared_cloud(path: Path, _digest: str) -> tuple[MapPoints, VoxelMap]:
+    """Load the initial map once for all sessions that this process examines. Point n of one is point n of the other."""
+    cloud = load_map(path)
+    voxels = VoxelMap()
+    if voxels.insert(cloud.points, cloud.normals, cloud.scores, -1) != len(cloud.points):
+        cloud = voxels.cloud()
+    return cloud, voxels
 
 
 def keep_poses(job: Job, path: Path, session: RecordedSession, scans: list[Any]) -> None:
@@ -158,18 +167,17 @@ def label(job: Job, path: Path, tell: Any) -> dict[str, Any]:
     record = job.output / f"{path.stem}.labelled.mcap"
     buffer = job.buffers / f"{path.stem}.ply"
     told_file = job.work / f"{path.stem}.labelled.json"
-    known = read_json(told_file)
-    if known is not None and known["key"] == key and record.exists() and buffer.exists():
-        return known
-    for left in (told_file, record, buffer):
+    finished = read_json(told_file)
+    if finished is not None and finished["key"] == key and record.exists() and buffer.exists():
+        return finished
+    for left in (told_file, record, buffer, buffer.with_suffix(".npy")):
         left.unlink(missing_ok=True)
     begin = time.perf_counter()
     session = open_session(job, path, tell)
-    pointmap = fill_buffer(load_map(job.map), session, job.mapping)
-    movable = trace_new(new_points(pointmap), session, job.rays)
-    made = classify(pointmap, movable, job.classing)
-    save_map(buffer, made.voxels.cloud(movable=made.movable, label=made.labels))
-    del pointmap, made, movable
+    known = shared_map(job.map, job.classing)
+    new = new_points(known.voxels, session, job.mapping, job.classing.apart)
+    movable = trace_new(new, session, job.rays)
+    save_buffer(buffer, classify(known, new.cloud(movable=movable), job.classing))
     write_frames(job, path, buffer, record)
     summary = Recording(record).summaries()[ANNOTATOR]
     told = {
@@ -188,7 +196,7 @@ def write_frames(job: Job, path: Path, buffer: Path, record: Path) -> None:
     """Write the labelled frames of a session as a recording; it appears whole or not at all."""
     partial = record.with_name(f"{path.stem}.partial.mcap")
     partial.unlink(missing_ok=True)
-    config: dict[str, Any] = {"session": str(path), "buffer": str(buffer), "every": job.every}
+    config: dict[str, Any] = {"session": str(path), "map": str(job.map), "buffer": str(buffer), "every": job.every}
     if job.frames is not None:
         config["frames"] = job.frames
     if (aligned := job.work / f"{path.stem}.poses.npz").exists():

@@ -1,0 +1,62 @@
+"""A buffer that grows and is traced while the robot drives, frame by frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from operators.annotation.buffer import Buffer, Classing, classify, enter_new, known_map
+from operators.annotation.refinement import Refinement, refine
+from operators.annotation.session import Floats, Scan
+from operators.pointmap import MapPoints, PointMap, Settings, VoxelMap
+from operators.pointray import PointRay, RaySettings
+
+
+class GrowingBuffer:
+    """What was known, what a session saw besides, and how movable both are so far."""
+
+    def __init__(self, known: MapPoints | None = None, *, resolution: float, classing: Classing | None = None) -> None:
+        """Start from a known map, or from nothing. resolution: of the lidar, radians."""
+        self.classing = Classing() if classing is None else classing
+        self.pointmap = PointMap(Settings(vertical_resolution=resolution))
+        self.known = VoxelMap(self.pointmap.map.voxel_size)
+        if known is not None:
+            self.known.insert_map(known)
+        rays = RaySettings(height=resolution)
+        self.known_rays, self.new_rays = PointRay(self.known, rays), PointRay(self.pointmap.map, rays)
+        self.frames = 0
+
+    def add(self, scan: Scan, *, known_too: bool = False) -> None:
+        """Take in a frame at its pose; `known_too`: look through the known points as well."""
+        enter_new(self.pointmap, self.known, scan.points, scan.world_from_lidar, self.frames, self.classing.apart)
+        self.new_rays.add(scan.points, scan.world_from_lidar)
+        if known_too and len(self.known):
+            self.known_rays.add(scan.points, scan.world_from_lidar)
+        self.frames += 1
+
+    def coarse(self, grain: float) -> tuple[Floats, Floats, npt.NDArray[np.bool_]]:
+        """Return one point (k, 3) of each cube of `grain` metres, its movable probability, and whether it is new."""
+        points = np.concatenate([self.known.points, self.pointmap.map.points])
+        movable = np.concatenate([self.known_rays.movable(), self.new_rays.movable()])
+        cells = np.floor(points / grain).astype(np.int64)
+        keys = (cells[:, 0] << 42) ^ ((cells[:, 1] & 0x1FFFFF) << 21) ^ (cells[:, 2] & 0x1FFFFF)
+        _, chosen = np.unique(keys, return_index=True)
+        return points[chosen], movable[chosen], chosen >= len(self.known)
+
+    def classified(self, refinement: Refinement | None = None) -> Buffer:
+        """Classify the new points.
+
+        Known points that the session saw through count as new ones: with one session alone that is all there is to
+        refine the map.
+        """
+        movable = self.known_rays.movable()
+        known = self.known.cloud(movable=movable)
+        refined, stays = refine(known, [movable], refinement)
+        gone, new = known.kept(~stays), self.pointmap.map.cloud()
+        together = MapPoints(
+            np.concatenate([gone.points, new.points]),
+            np.concatenate([gone.normals, new.normals]),
+            np.concatenate([gone.scores, new.scores]),
+            np.concatenate([movable[~stays], self.new_rays.movable()]),
+        )
+        return classify(known_map(refined, self.classing), together, self.classing)
