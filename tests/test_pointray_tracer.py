@@ -10,9 +10,11 @@ from test_pointmap_room import BASE_FROM_LIDAR, BOXES, ROOM, scan
 
 from graph.geometry import inverse, planar, transform
 from operators.pointmap import MapPoints, PointMap, VoxelMap
+from operators.pointmap.store import local_of
+from operators.pointmap.voxels import unpack
 from operators.pointray import PointRay, RaySettings
-from operators.pointray.frustums import frustum_grid
-from operators.pointray.looks import ALONG_X, ALONG_Y, ALONG_Z, distinct_voxels, hidden, window
+from operators.pointray.frustums import behind, frustum_grid, hidden
+from operators.pointray.occupied import blocks_of_points, with_neighbours
 
 PERSON = (np.array([-1.0, -1.0, 0.0]), np.array([-0.6, -0.6, 1.7]))
 
@@ -173,7 +175,8 @@ def test_the_frustum_grid_keeps_the_nearest_and_an_empty_cell_frees_nothing():
     assert sorted(filled.tolist()) == pytest.approx(
         [3.0 - 3.0 * math.radians(1.33) / 2, 8 - 8 * math.radians(1.33) / 2]
     )
-    assert grid.farthest.max() == filled.max()
+    assert grid.freest.max() == filled.max()
+    assert grid.farthest.max() == 8.0
     near = frustum_grid(np.array([0.5], np.float32), theta[:1], phi[:1], math.radians(1.33), math.radians(0.1))
     assert near.free.max() == pytest.approx(0.47)
 
@@ -191,17 +194,51 @@ def test_a_ball_is_hidden_exactly_when_all_of_it_is_behind():
     assert not hidden(grid, 0.1, 0.0, 0.0, 0.5)
 
 
-def test_voxels_are_listed_once_by_first_visit():
-    points = np.random.default_rng(0).normal(size=(5000, 3)) * 0.3
-    keys = distinct_voxels(points, 0.1)
-    wanted = np.unique(np.floor(points / 0.1).astype(int), axis=0)
-    assert len(keys) == len(wanted) == len(set(keys.tolist()))
+def voxels_of(blocks):
+    """The taken voxels of a table of blocks."""
+    found = set()
+    for key, mask in zip(blocks.keys, blocks.masks, strict=True):
+        if key != -1:
+            corner = 4 * np.array(unpack(key))
+            for i, j, k in np.ndindex(4, 4, 4):
+                if (int(mask) >> local_of(i, j, k)) & 1:
+                    found.add(tuple((corner + np.array([i, j, k])).tolist()))
+    return found
 
 
-def test_windows_cover_the_27_neighbours_once():
-    for local in range(4):
-        taken = [4 * side + bit for side in (-1, 0, 1) for bit in range(4) if (window(local, side) >> bit) & 1]
-        assert taken == [local - 1, local, local + 1]
-    for i, j, k in np.ndindex(4, 4, 4):
-        bits = int(ALONG_X[1 << i]) & int(ALONG_Y[1 << j]) & int(ALONG_Z[1 << k])
-        assert bits & (2**64 - 1) == 1 << (i | (j << 2) | (k << 4))
+@pytest.mark.parametrize("count", [0, 1, 40, 30_000])
+def test_occupied_are_the_voxels_of_the_points_and_their_26_neighbours(count):
+    points = np.random.default_rng(count).normal(size=(count, 3)) * 0.4
+    taken = {tuple(voxel) for voxel in np.floor(points / 0.1).astype(int).tolist()}
+    blocks = blocks_of_points(points, 0.1)
+    assert voxels_of(blocks) == taken
+    steps = [(a, b, c) for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 0, 1)]
+    assert voxels_of(with_neighbours(blocks)) == {(i + a, j + b, k + c) for i, j, k in taken for a, b, c in steps}
+
+
+def test_points_beyond_all_voxels_occupy_none():
+    points = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [1e9, 0, 0], [0.05, 0.05, 0.05]])
+    assert voxels_of(blocks_of_points(points, 0.1)) == {(0, 0, 0)}
+
+
+def test_nothing_that_is_free_is_called_behind():
+    points = scan(planar(0.0, 0.0, 0.3, 0.64))
+    x, y, z = points.T.astype(np.float64)
+    rho, level = np.sqrt(x**2 + y**2 + z**2), np.hypot(x, y)
+    theta, phi = np.arctan2(z, level), np.arctan2(y, x)
+    grid = frustum_grid(*(a.astype(np.float32) for a in (rho, theta, phi)), math.radians(1.33), math.radians(0.35))
+    random = np.random.default_rng(0)
+    tried = 0
+    for n in random.choice(len(points), 400):
+        centre = points[n] * random.uniform(0.3, 1.2) + random.normal(size=3) * 0.1
+        distance, flat = np.linalg.norm(centre), np.hypot(*centre[:2])
+        if not behind(grid, distance, np.arctan2(centre[2], flat), np.arctan2(centre[1], centre[0]), flat, 0.1):
+            continue
+        offsets = random.normal(size=(200, 3))
+        ball = centre + 0.0999 * offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
+        row = np.floor((np.arctan2(ball[:, 2], np.hypot(*ball.T[:2])) - grid.lowest) / grid.height).astype(int)
+        column = np.floor((np.arctan2(ball[:, 1], ball[:, 0]) + np.pi) / grid.width).astype(int) % grid.free.shape[1]
+        inside = (row >= 0) & (row < grid.free.shape[0])
+        assert (np.linalg.norm(ball, axis=1)[inside] >= grid.free[row[inside], column[inside]]).all()
+        tried += 1
+    assert tried > 50

@@ -13,11 +13,11 @@ from operators.pointmap.angles import spherical
 from operators.pointmap.frame import separate
 from operators.pointmap.voxel_map import VoxelMap
 from operators.pointray.frustums import frustum_grid
-from operators.pointray.looks import FREE, LOOKS, STAMP, distinct_voxels, see_occupied, see_through
+from operators.pointray.looks import FREE, LOOKS, look
+from operators.pointray.occupied import blocks_of_points, with_neighbours
 
 Floats = npt.NDArray[np.float32]
 
-NEVER = -1
 UNKNOWN = 0.5  # movable probability of a point that was hardly looked at
 
 
@@ -43,8 +43,7 @@ class PointRay:
         self.voxels = voxels
         self.settings = RaySettings() if settings is None else settings
         self.frames = 0
-        self.counts = np.zeros((0, 4), np.int32)
-        self.touched = np.zeros(0, np.int64)  # scratch of `see_occupied`
+        self.counts = np.zeros((0, 2), np.int32)
 
     def add(self, points: npt.NDArray[Any], world_from_lidar: Matrix) -> int:
         """Take in one frame (n, 3) in the sensor's frame, at its pose. Returns how many map points were tried."""
@@ -55,16 +54,14 @@ class PointRay:
         rho, theta, phi = spherical(x, y, z)
         frustums = frustum_grid(rho, theta, phi, self.settings.height, self.settings.width)
         world = transform(world_from_lidar, np.stack([x, y, z], axis=1).astype(np.float64))
-        size, store = self.voxels.voxel_size, self.voxels.store
-        if len(self.touched) != len(store.table):
-            self.touched = np.zeros(len(store.table), np.int64)
-        see_occupied(store, self.counts, distinct_voxels(world, size), self.touched, self.frames)
+        size = self.voxels.voxel_size
+        occupied = with_neighbours(blocks_of_points(world, size))
         box = np.stack([world.min(axis=0), world.max(axis=0)])
-        tried = see_through(
-            store, self.counts, frustums, inverse(world_from_lidar), box, size, self.settings.level, self.frames
-        )
         self.frames += 1
-        return int(tried)
+        lidar_from_world = inverse(world_from_lidar)
+        return int(
+            look(self.voxels.store, self.counts, frustums, occupied, lidar_from_world, box, size, self.settings.level)
+        )
 
     def looks(self) -> npt.NDArray[np.int32]:
         """Return how often each point of the map was looked at (n,)."""
@@ -81,7 +78,6 @@ class PointRay:
 
     def _grow(self) -> None:
         if len(self.counts) < len(self.voxels):
-            larger = np.zeros((max(len(self.voxels), 2 * len(self.counts)), 4), np.int32)
-            larger[:, STAMP] = NEVER
+            larger = np.zeros((max(len(self.voxels), 2 * len(self.counts)), 2), np.int32)
             larger[: len(self.counts)] = self.counts
             self.counts = larger
