@@ -19,7 +19,7 @@ launch: setup
 	$(BIN)/retracer launch graph.yaml $(if $(RECORD),--record $(RECORD))
 
 test: setup
-	$(BIN)/python -m pytest -n 2 -m "not slow"
+	$(BIN)/python -m pytest -n 3 -m "not slow"
 
 test-all: setup
 	$(BIN)/python -m pytest -n 2
