@@ -102,8 +102,9 @@ def behind(frustums: Frustums, rho: float, theta: float, phi: float, level: floa
     nearest = rho - radius
     tall = 1.05 * radius / rho + SLACK  # above the arc sine of all that is below a half
     wide = 1.05 * radius / level + SLACK
-    low = max(0, math.floor((theta - tall - frustums.lowest) / frustums.height))
-    high = min(frustums.free.shape[0] - 1, math.floor((theta + tall - frustums.lowest) / frustums.height))
+    per_row = 1.0 / frustums.height
+    low = max(0, math.floor((theta - tall - frustums.lowest) * per_row))
+    high = min(frustums.free.shape[0] - 1, math.floor((theta + tall - frustums.lowest) * per_row))
     first = math.floor((phi - wide + math.pi) * (TILES / (2.0 * math.pi)))
     last = math.floor((phi + wide + math.pi) * (TILES / (2.0 * math.pi)))
     for tile in range(first, last + 1):

@@ -73,24 +73,39 @@ def cells_within(store: Store, low: Doubles, high: Doubles, edge: float) -> Long
     return found[:count]
 
 
+@njit(cache=True)
+def ones(mask: int) -> int:
+    """Count the bits of a mask of 64 (not all of them set)."""
+    return ones_below(np.int64(mask), 63) + np.int64(mask >> np.uint64(63))
+
+
 @njit(cache=True, error_model="numpy")
 def list_blocks(
-    cells: Longs, cell: int, edge: float, lidar_from_world: Doubles, keys: Longs, x: Floats, y: Floats, z: Floats
+    cells: Longs,
+    cell: int,
+    edge: float,
+    lidar_from_world: Doubles,
+    occupied: Blocks,
+    keys: Longs,
+    x: Floats,
+    y: Floats,
+    z: Floats,
 ) -> int:
     """Write the keys of the blocks (of `edge` metres) of a cell and their centres in the sensor's frame; how many."""
+    last = len(occupied.keys) - 1
     m = lidar_from_world
     i, j, k = unpack(cells[cell, KEY])
     count = 0
     for c in range(CELL_BLOCKS):
-        layer = cells[cell, LAYER + c]
-        if layer == 0:
-            continue
-        for local in range(CELL_BLOCKS * CELL_BLOCKS):
-            if (layer >> local) & 1 == 0:
-                continue
+        layer = np.uint64(cells[cell, LAYER + c])
+        while layer != EMPTY:
+            low = layer & (~layer + np.uint64(1))
+            layer ^= low
+            local = ones(low - np.uint64(1))
             a, b = (i << CELL_BITS) + (local & 7), (j << CELL_BITS) + (local >> 3)
             px, py, pz = (a + 0.5) * edge, (b + 0.5) * edge, ((k << CELL_BITS) + c + 0.5) * edge
             keys[count] = pack(a, b, (k << CELL_BITS) + c)
+            prefetch(occupied.keys, spread(keys[count], last))
             x[count] = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3]
             y[count] = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]
             z[count] = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
@@ -179,12 +194,6 @@ def see_occupied(
     return count
 
 
-@njit(cache=True)
-def ones(mask: int) -> int:
-    """Count the bits of a mask of 64 (not all of them set)."""
-    return ones_below(np.int64(mask), 63) + np.int64(mask >> np.uint64(63))
-
-
 @njit(cache=True, error_model="numpy")
 def see_through(
     store: Store,
@@ -267,7 +276,7 @@ def look(
         cz = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
         if hidden(frustums, cx, cy, cz, 0.5 * math.sqrt(3.0) * edge + margin):
             continue
-        blocks = list_blocks(store.cells, cell, block, m, keys, x, y, z)
+        blocks = list_blocks(store.cells, cell, block, m, occupied, keys, x, y, z)
         fill_spherical(x[:blocks], y[:blocks], z[:blocks], rho, theta, phi)
         radius = 0.5 * math.sqrt(3.0) * block
         blocks = select_blocks(blocks, keys, x, y, rho, theta, phi, radius, occupied, frustums, taken, store.table)

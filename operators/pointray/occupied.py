@@ -5,7 +5,7 @@ Blocks of 4 x 4 x 4 voxels as in the map's store, a mask of 64 bits each, in a h
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +32,7 @@ class Blocks(NamedTuple):
 
     keys: Longs  # (slots,) or -1
     masks: Masks  # (slots,) the taken voxels
-    count: Longs  # (1,)
+    used: Longs  # (1,) how many slots
 
 
 @njit(cache=True)
@@ -52,34 +52,29 @@ def slot_of(keys: Longs, key: int) -> int:
 
 
 @njit(cache=True)
-def take(blocks: Blocks, key: int, mask: int) -> None:
+def take(blocks: Blocks, key: int, mask: Any) -> None:
     """Add taken voxels to a block. The table must have room."""
     slot = slot_of(blocks.keys, key)
     if blocks.keys[slot] == NONE:
         blocks.keys[slot] = key
         blocks.masks[slot] = mask
-        blocks.count[0] += 1
+        blocks.used[0] += 1
     else:
         blocks.masks[slot] |= mask
 
 
 @njit(cache=True)
-def roomy(blocks: Blocks, more: int) -> Blocks:
-    """Return the table with room for so many more blocks, at most half full."""
-    slots = len(blocks.keys)
-    if 2 * (blocks.count[0] + more) <= slots:
-        return blocks
-    while 2 * (blocks.count[0] + more) > slots:
-        slots *= 2
-    larger = empty_blocks(slots)
+def larger(blocks: Blocks) -> Blocks:
+    """Return a table with twice the slots and the same blocks. Not called for every block: to hand a table back costs."""
+    result = empty_blocks(2 * len(blocks.keys))
     for slot in range(len(blocks.keys)):
         if blocks.keys[slot] != NONE:
-            take(larger, blocks.keys[slot], blocks.masks[slot])
-    return larger
+            take(result, blocks.keys[slot], blocks.masks[slot])
+    return result
 
 
 @njit(cache=True, inline="always")
-def neighbours(mask: int, axis: int, side: int) -> int:
+def neighbours(mask: Any, axis: int, side: int) -> Any:
     """Return the voxels next to those of a mask along an axis: of the block itself (side 0) or of the block beside it.
 
     For side 0 the voxels themselves are among them.
@@ -92,10 +87,20 @@ def neighbours(mask: int, axis: int, side: int) -> int:
 
 
 @njit(cache=True, error_model="numpy")
+def carried(pose: Doubles, x: Floats, y: Floats, z: Floats) -> Doubles:
+    """Return points, given by their coordinates (n,), moved by a pose (4, 4), as (n, 3) in double precision."""
+    moved = np.empty((len(x), 3))
+    for n in range(len(x)):
+        for axis in range(3):
+            moved[n, axis] = pose[axis, 0] * x[n] + pose[axis, 1] * y[n] + pose[axis, 2] * z[n] + pose[axis, 3]
+    return moved
+
+
+@njit(cache=True, error_model="numpy")
 def blocks_of_points(points: Doubles, size: float) -> Blocks:
     """Return the blocks with the voxels, of `size` metres, that hold the points (n, 3)."""
     blocks = empty_blocks(1 << 14)
-    last, mask = np.int64(NONE), EMPTY
+    last, mask = np.int64(NONE), EMPTY  # a mask is uint64 throughout: signed bits would spread
     for n in range(len(points)):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         if not (abs(x) < FARTHEST * size and abs(y) < FARTHEST * size and abs(z) < FARTHEST * size):
@@ -104,8 +109,9 @@ def blocks_of_points(points: Doubles, size: float) -> Blocks:
         key = pack(i >> BLOCK_BITS, j >> BLOCK_BITS, k >> BLOCK_BITS)
         if key != last:  # neighbours in a scan mostly share their block
             if last != NONE:
+                if 2 * (blocks.used[0] + 1) > len(blocks.keys):
+                    blocks = larger(blocks)
                 take(blocks, last, mask)
-                blocks = roomy(blocks, 1)
             last, mask = key, EMPTY
         mask |= np.uint64(1) << np.uint64(local_of(i, j, k))
     if last != NONE:
@@ -120,7 +126,8 @@ def with_neighbours(blocks: Blocks) -> Blocks:
     for slot in range(len(blocks.keys)):
         if blocks.keys[slot] == NONE:
             continue
-        wide = roomy(wide, 27)
+        if 2 * (wide.used[0] + 27) > len(wide.keys):
+            wide = larger(wide)
         i, j, k = unpack(blocks.keys[slot])
         for a in range(-1, 2):
             along_x = neighbours(blocks.masks[slot], 0, a)

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from graph.geometry import Matrix, inverse, transform
+from graph.geometry import Matrix, inverse
 from operators.pointmap.angles import spherical
 from operators.pointmap.frame import separate
 from operators.pointmap.voxel_map import VoxelMap
 from operators.pointray.frustums import frustum_grid
 from operators.pointray.looks import FREE, LOOKS, look
-from operators.pointray.occupied import blocks_of_points, with_neighbours
+from operators.pointray.occupied import blocks_of_points, carried, with_neighbours
 
 Floats = npt.NDArray[np.float32]
 
@@ -53,7 +53,7 @@ class PointRay:
             return 0
         rho, theta, phi = spherical(x, y, z)
         frustums = frustum_grid(rho, theta, phi, self.settings.height, self.settings.width)
-        world = transform(world_from_lidar, np.stack([x, y, z], axis=1).astype(np.float64))
+        world = carried(np.ascontiguousarray(world_from_lidar, np.float64), x, y, z)
         size = self.voxels.voxel_size
         occupied = with_neighbours(blocks_of_points(world, size))
         box = np.stack([world.min(axis=0), world.max(axis=0)])
