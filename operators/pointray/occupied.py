@@ -65,7 +65,7 @@ def take(blocks: Blocks, key: int, mask: Any) -> None:
 
 @njit(cache=True)
 def larger(blocks: Blocks) -> Blocks:
-    """Return a table with twice the slots and the same blocks. Not called for every block: to hand a table back costs."""
+    """Return a table with twice the slots and the same blocks. Not called for every block: handing one back costs."""
     result = empty_blocks(2 * len(blocks.keys))
     for slot in range(len(blocks.keys)):
         if blocks.keys[slot] != NONE:
