@@ -18,10 +18,12 @@ from graph.errors import UserError
 DOMAIN = {
     "view": ("operators.views.view_command", "show a recording in Rerun"),
     "import": ("operators.scans.import_command", "make a session of anyone's scans, captures and bags"),
+    "export": ("operators.scans.export_command", "turn a recording into a ROS 2 bag, which Foxglove opens too"),
     "map": ("operators.annotation.map_command", "make the initial map of a building from a mapping session"),
     "annotate": ("operators.annotation.annotate_command", "label recorded sessions without a human"),
     "train": ("operators.kpconv.train_command", "train a segmenter on labelled sessions"),
     "evaluate": ("operators.kpconv.evaluate_command", "hold a segmenter against the truth of recorded sessions"),
+    "rounds": ("operators.rounds.rounds_command", "drive, label, learn, and drive better, round after round"),
     "building": ("sim.building_command", "draw and check a building"),
 }
 
