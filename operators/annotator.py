@@ -8,6 +8,7 @@ annotator:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from operators.annotation.projection import Projector
 from operators.annotation.session import LABELS, LONG_TERM, PERMANENT, SHORT_TERM, UNCERTAIN, Scan
 from operators.pointmap import Trail, load_map
 from operators.pointmap.rehearsal import room_scan
+from operators.pointray import RaySettings
 
 SECOND = 1_000_000_000  # nanoseconds
 WAITING = 20  # frames that wait for their pose at most
@@ -40,7 +42,8 @@ class Annotator(Operator):
         trace_known: int = 5  # one frame of so many looks at the points of the map too, for the dashboard
         period: float = 5.0  # seconds between two messages of the annotated map
         grain: float = 0.12  # metres between its points
-        vertical_resolution: float = 0.0232  # radians between two beams of the lidar
+        vertical_resolution: float = math.radians(1.33)  # between two beams of the lidar
+        frustum_width: float = math.radians(0.1)  # of the ray tracing
 
     class Outputs(msgspec.Struct):
         """The map with movable probabilities now and then; the labelled frames at the end."""
@@ -55,7 +58,7 @@ class Annotator(Operator):
             if getattr(c, name) < 1:
                 raise ValueError(f"annotator.{name} wants at least 1; it was given {getattr(c, name)}")
         known = None if c.map is None else load_map(c.map)
-        self.buffer = GrowingBuffer(known, resolution=c.vertical_resolution)
+        self.buffer = GrowingBuffer(known, RaySettings(height=c.vertical_resolution, width=c.frustum_width))
         self.trail = Trail()
         self.waiting: dict[int, PointCloud] = {}  # frames by stamp, until their pose is known
         self.kept: list[tuple[PointCloud, Scan]] = []

@@ -20,7 +20,7 @@ PERIOD = 100_000_000  # ns
 CUPBOARD = (np.array([4.5, 3.0, 0.0]), np.array([5.3, 3.8, 1.6]))  # stands in the mapping session, then is gone
 CHAIR = (np.array([-1.5, -2.2, 0.0]), np.array([-1.0, -1.7, 0.9]))
 GROUND, WALL, CHAIR_TRUTH, WALKER = 1, 2, 5, 6
-DIRECTIONS = rays(columns=1024)
+DIRECTIONS = rays(columns=512)
 
 
 def place(step: int, shift: float = 0.0) -> np.ndarray:

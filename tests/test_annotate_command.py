@@ -16,13 +16,15 @@ from graph.recording import Recording
 from operators.pointmap import load_map
 from tests.room_tour import CUPBOARD, inside, record
 
+COARSE = ("--frustum-width", "0.7")  # of the room's lidar, 512 columns
+
 
 @pytest.fixture(scope="module")
 def building(tmp_path_factory):
     """A mapping session with a cupboard and its map; two sessions without the cupboard, with people."""
     folder = tmp_path_factory.mktemp("building")
     record(folder / "mapping.mcap", cupboard=True, seed=1)
-    assert main(["map", str(folder / "mapping.mcap"), "-o", str(folder / "map.ply"), "--quiet"]) == 0
+    assert main(["map", str(folder / "mapping.mcap"), "-o", str(folder / "map.ply"), *COARSE, "--quiet"]) == 0
     record(folder / "monday.mcap", chair=True, walks=True, seed=2)
     record(folder / "tuesday.mcap", walks=True, seed=3)
     return folder
@@ -45,7 +47,7 @@ def annotate(folder: Path, arguments: list[str]) -> dict:
     ]
     told = io.StringIO()
     with contextlib.redirect_stdout(told):
-        assert main(["annotate", *placed, "--json"]) == 0
+        assert main(["annotate", *placed, *COARSE, "--json"]) == 0
     return json.loads(told.getvalue())
 
 

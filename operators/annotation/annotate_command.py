@@ -47,6 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--least-overlap", type=float, default=Acceptance().least_overlap, metavar="SHARE",
                         help="of what a session saw, that the map must have")  # fmt: skip
     parser.add_argument("--vertical-resolution", type=float, default=1.33, metavar="DEG", help="of the lidar")
+    parser.add_argument("--frustum-width", type=float, default=0.1, metavar="DEG", help="of the ray tracing")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.add_argument("--json", action="store_true", help="print the outcome as JSON")
 
@@ -72,8 +73,9 @@ def job_of(args: argparse.Namespace) -> Job:
     for name, least in (("every", 1), ("workers", 1)):
         if getattr(args, name) < least:
             raise UserError(f"--{name} wants at least {least}; it was given {getattr(args, name)}")
-    if not 0.1 <= args.vertical_resolution <= 10.0:
-        raise UserError(f"--vertical-resolution wants 0.1 to 10 degrees; it was given {args.vertical_resolution:g}")
+    for name, least in (("vertical-resolution", 0.1), ("frustum-width", 0.02)):
+        if not least <= (given := getattr(args, name.replace("-", "_"))) <= 10.0:
+            raise UserError(f"--{name} wants {least:g} to 10 degrees; it was given {given:g}")
     names = [path.name for path in args.sessions]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise UserError(f"two sessions are named {twice[0]}; what comes out of them would be one file")
@@ -94,6 +96,7 @@ def job_of(args: argparse.Namespace) -> Job:
         refinement=Refinement(),
         classing=Classing(permanent=args.permanent),
         resolution=math.radians(args.vertical_resolution),
+        width=math.radians(args.frustum_width),
     )
 
 

@@ -38,8 +38,9 @@ class Classing(NamedTuple):
     permanent: Literal["plane", "ring"] = "plane"  # "ring" as the authors
     ring: float = 0.10  # metres around the map, and around what can move
     thickness: float = 0.04  # metres from the plane of the nearest permanent point
+    alike: float = 0.8  # cosine between its normal and that of the point that joins
     growth: float = 0.12  # metres along it, at each step
-    steps: int = 4
+    steps: int = 1
 
 
 class KnownMap(NamedTuple):
@@ -80,7 +81,7 @@ class Buffer(NamedTuple):
 def new_points(
     known: VoxelMap, session: Session, settings: MapSettings | None = None, apart: float = Classing().apart
 ) -> VoxelMap:
-    """Map the valid frames of a session at their own poses, without new alignment, `apart` metres from the known map."""
+    """Map the valid frames of a session at their own poses, unaligned, what is `apart` metres from the known map."""
     pointmap = PointMap(settings)
     for number, scan in enumerate(session):
         if scan.valid:
@@ -129,7 +130,7 @@ def classify(known: KnownMap, new: MapPoints, settings: Classing | None = None) 
     labels[new.movable < settings.long] = LONG_TERM
     known_labels = known.labels
     if settings.permanent == "plane":
-        extend_along_planes(known.voxels, new, labels, settings)
+        extend_along_planes(known, new, labels, settings)
     else:
         touched = extend_by_ring(known.voxels, new, labels, settings)
         known_labels = np.where(touched & (known_labels == PERMANENT), UNCERTAIN, known_labels).astype(np.uint8)
@@ -160,23 +161,26 @@ def extend_by_ring(known: VoxelMap, new: MapPoints, labels: Labels, settings: Cl
     return found >= 0
 
 
-def extend_along_planes(known: VoxelMap, new: MapPoints, labels: Labels, settings: Classing) -> None:
+def extend_along_planes(known: KnownMap, new: MapPoints, labels: Labels, settings: Classing) -> None:
     """Call permanent what continues the planes of the known: holes in walls close, what stands before them stays out.
 
-    A new point that nobody saw through joins when the nearest permanent point is near and its plane passes through the
-    point; a few steps close the hole that a cupboard left.
+    A new point that nobody saw through joins when the nearest permanent point is near, its plane passes through the
+    point, and both face the same way; a few steps close the hole that a cupboard left. Ground does not grow: it would
+    climb up the legs of the furniture.
     """
     candidates = np.flatnonzero(labels != SHORT_TERM)
-    front, points, normals = known, known.points, known.normals
+    front, points, normals = known.voxels, known.voxels.points, known.voxels.normals
+    upright = known.labels == PERMANENT
     for _ in range(settings.steps):
-        if not len(candidates) or not len(points):
+        if not len(candidates) or not upright.any():
             return
         found, _ = front.nearest(new.points[candidates], settings.growth)
-        near = found >= 0
+        near = (found >= 0) & upright[found]
         candidates_near, nearest = candidates[near], found[near]
-        apart = (new.points[candidates_near] - points[nearest]) * normals[nearest]
-        joins = candidates_near[np.abs(apart.sum(axis=1)) < settings.thickness]
+        apart = ((new.points[candidates_near] - points[nearest]) * normals[nearest]).sum(axis=1)
+        alike = np.abs((new.normals[candidates_near] * normals[nearest]).sum(axis=1)) > settings.alike
+        joins = candidates_near[alike & (np.abs(apart) < settings.thickness)]
         labels[joins] = PERMANENT
         front = subset(new, np.isin(np.arange(len(labels)), joins))
-        points, normals = front.points, front.normals
+        points, normals, upright = front.points, front.normals, np.ones(len(front), np.bool_)
         candidates = candidates[labels[candidates] != PERMANENT]

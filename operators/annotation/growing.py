@@ -15,14 +15,13 @@ from operators.pointray import PointRay, RaySettings
 class GrowingBuffer:
     """What was known, what a session saw besides, and how movable both are so far."""
 
-    def __init__(self, known: MapPoints | None = None, *, resolution: float, classing: Classing | None = None) -> None:
-        """Start from a known map, or from nothing. resolution: of the lidar, radians."""
+    def __init__(self, known: MapPoints | None, rays: RaySettings, *, classing: Classing | None = None) -> None:
+        """Start from a known map, or from nothing."""
         self.classing = Classing() if classing is None else classing
-        self.pointmap = PointMap(Settings(vertical_resolution=resolution))
+        self.pointmap = PointMap(Settings(vertical_resolution=rays.height))
         self.known = VoxelMap(self.pointmap.map.voxel_size)
         if known is not None:
             self.known.insert_map(known)
-        rays = RaySettings(height=resolution)
         self.known_rays, self.new_rays = PointRay(self.known, rays), PointRay(self.pointmap.map, rays)
         self.frames = 0
 

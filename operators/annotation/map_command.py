@@ -32,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--voxel", type=float, default=0.03, metavar="M", help="one point of the map a voxel")
     parser.add_argument("--threshold", type=float, default=0.7, help="movable probability beyond which points go")
     parser.add_argument("--vertical-resolution", type=float, default=1.33, metavar="DEG", help="of the lidar")
+    parser.add_argument("--frustum-width", type=float, default=0.1, metavar="DEG", help="of the ray tracing")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.add_argument("--json", action="store_true", help="print the outcome as JSON")
 
@@ -42,8 +43,9 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"a map is a .ply file; {args.output} is none")
     if not 0.0 < args.voxel <= 1.0:
         raise UserError(f"--voxel wants metres above 0, up to 1; it was given {args.voxel:g}")
-    if not 0.1 <= args.vertical_resolution <= 10.0:
-        raise UserError(f"--vertical-resolution wants 0.1 to 10 degrees; it was given {args.vertical_resolution:g}")
+    for name, least in (("vertical-resolution", 0.1), ("frustum-width", 0.02)):
+        if not least <= (given := getattr(args, name.replace("-", "_"))) <= 10.0:
+            raise UserError(f"--{name} wants {least:g} to 10 degrees; it was given {given:g}")
     if not 0.0 <= args.threshold <= 1.0:
         raise UserError(f"--threshold is a probability; it was given {args.threshold:g}")
     if not args.output.parent.is_dir():
@@ -85,7 +87,7 @@ def map_session(args: argparse.Namespace) -> tuple[FirstMap, float]:
         stamps = sorted(session.odometry)
         made = first_map(
             session,
-            rays=RaySettings(height=resolution),
+            rays=RaySettings(height=resolution, width=math.radians(args.frustum_width)),
             threshold=args.threshold,
             settings=Settings(map_voxel=args.voxel, vertical_resolution=resolution),
         )

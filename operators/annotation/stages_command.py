@@ -47,7 +47,8 @@ class Job(NamedTuple):
     acceptance: Acceptance
     refinement: Refinement
     classing: Classing
-    resolution: float  # of the lidar, radians
+    resolution: float  # of the lidar, radians between two beams
+    width: float  # of the frustums, radians
 
     @property
     def work(self) -> Path:
@@ -62,7 +63,7 @@ class Job(NamedTuple):
     @property
     def rays(self) -> RaySettings:
         """Return the settings of the tracing."""
-        return RaySettings(height=self.resolution)
+        return RaySettings(height=self.resolution, width=self.width)
 
     @property
     def mapping(self) -> Settings:
@@ -88,7 +89,9 @@ def session_key(job: Job, path: Path) -> str:
     """Say what a session is, and what the first stage does to it, in one word."""
     recording = Recording(path)
     known = (VERSION, recording.metadata, path.stat().st_size, job.frames, job.poses, job.align)
-    return digest(repr((*known, job.acceptance, job.refinement, job.resolution, job.map_digest)).encode()).hex()
+    return digest(
+        repr((*known, job.acceptance, job.refinement, job.resolution, job.width, job.map_digest)).encode()
+    ).hex()
 
 
 def open_session(job: Job, path: Path, tell: Any) -> RecordedSession:
