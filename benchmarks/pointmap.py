@@ -25,9 +25,10 @@ LOOK_AHEAD = 14  # steps of 5 cm
 
 
 class Drive(NamedTuple):
-    """Frames of a drive, and where odometry and truth say they were measured."""
+    """Frames of a drive, what each of their points is, and where odometry and truth say they were measured."""
 
     frames: list[np.ndarray]
+    truth: list[np.ndarray]  # classes as in graph.messages.PointCloud
     odom_from_base: list[Matrix]
     world_from_base: list[Matrix]
     base_from_lidar: Matrix
@@ -66,16 +67,18 @@ def whole_map(seed: int) -> MapPoints:
     return pointmap.map.cloud()
 
 
-def drive(tour: str, seed: int, count: int = FRAMES) -> Drive:
+def drive(tour: str, seed: int, count: int = FRAMES, scenario: str = "easy") -> Drive:
     """Follow a tour by its true pose and record frames at 10 Hz."""
     from sim import World
 
-    world = World(BUILDING, "easy", tour, seed)
+    world = World(BUILDING, scenario, tour, seed)
     way, place = ways(world), 0
-    record = Drive([], [], [], world.base_from_lidar())
+    record = Drive([], [], [], [], world.base_from_lidar())
     linear, angular = 0.0, 0.0
     while len(record.frames) < count and place < len(way) - LOOK_AHEAD:
-        record.frames.append(world.step(linear, angular).points)
+        scan = world.step(linear, angular)
+        record.frames.append(scan.points)
+        record.truth.append(scan.truth)
         state = world.state()
         record.odom_from_base.append(state.odom_from_base)
         record.world_from_base.append(state.world_from_base)
@@ -95,7 +98,7 @@ def errors(poses: list[Matrix], record: Drive) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pointmap_poses(record: Drive, initial: MapPoints | None) -> tuple[list[Matrix], float]:
-    """Localize, map and keep the occupancy grid as the localizer does; returns poses and the median CPU seconds a frame."""
+    """Do what the localizer does: align, map, keep the grid. Returns poses and the median CPU seconds a frame."""
     mapper = Mapper(initial=initial)
     world_from_odom, poses, seconds = np.eye(4), [], []
     for points, odom_from_base in zip(record.frames, record.odom_from_base, strict=True):
@@ -151,13 +154,16 @@ def from_start(start_from_lidar: list[Matrix], record: Drive) -> list[Matrix]:
     return [start @ pose @ inverse(record.base_from_lidar) for pose in start_from_lidar]
 
 
-def row(name: str, value: float, unit: str, peer: str = "", peer_value: float | None = None) -> dict[str, Any]:
-    """Make a row of the benchmark table; ratio: ours to the peer's for rates, the peer's to ours for errors."""
+def row(
+    name: str, value: float, unit: str, peer: str = "", peer_value: float | None = None, *, more: bool = False
+) -> dict[str, Any]:
+    """Make a row of the benchmark table; ratio: ours to the peer's where more is better, else the peer's to ours."""
     ratio = None
     if peer_value is not None:
-        ratio = round(value / peer_value if unit.endswith("/s") else peer_value / value, 2)
-    shown = None if peer_value is None else round(peer_value, 2)
-    return {"name": name, "value": round(value, 2), "unit": unit, "peer": peer, "peer_value": shown, "ratio": ratio}
+        best = value / max(peer_value, 1e-9) if more or unit.endswith("/s") else peer_value / max(value, 1e-9)
+        ratio = round(best, 2)
+    shown = None if peer_value is None else round(peer_value, 3)
+    return {"name": name, "value": round(value, 3), "unit": unit, "peer": peer, "peer_value": shown, "ratio": ratio}
 
 
 def rows() -> list[dict[str, Any]]:
@@ -169,16 +175,19 @@ def rows() -> list[dict[str, Any]]:
         row(f"pointmap rate, map of {len(initial.points) / 1e6:.1f} M points, one core", 1 / seconds, "frames/s"),
         row("pointmap error with map, median", 100 * float(np.median(metres)), "cm"),
         row("pointmap error with map, p95", 100 * float(np.percentile(metres, 95)), "cm"),
-        row("pointmap error with map, median", float(np.median(degrees)), "deg"),
+        row("pointmap turn error with map, median", float(np.median(degrees)), "deg"),
+        row("pointmap turn error with map, p95", float(np.percentile(degrees, 95)), "deg"),
     ]
     poses, seconds = pointmap_poses(record, None)
-    metres, _ = errors(poses, record)
+    metres, degrees = errors(poses, record)
     for peer, task in (("kiss-icp (no odometry)", kiss_icp_poses), ("small-gicp (no odometry)", small_gicp_poses)):
         peer_poses, peer_seconds = task(record)
-        peer_metres, _ = errors(peer_poses, record)
+        peer_metres, peer_degrees = errors(peer_poses, record)
         found.append(row("pointmap rate without map", 1 / seconds, "frames/s", peer, 1 / peer_seconds))
         median, peer_median = 100 * float(np.median(metres)), 100 * float(np.median(peer_metres))
         found.append(row("pointmap error without map, median", median, "cm", peer, peer_median))
+        turn, peer_turn = float(np.median(degrees)), float(np.median(peer_degrees))
+        found.append(row("pointmap turn error without map, median", turn, "deg", peer, peer_turn))
     return found
 
 
