@@ -15,6 +15,7 @@ from graph.status import progress_bar
 from sim.building import Building, BuildingError
 from sim.building_file import find, read
 from sim.inspection import inspect
+from sim.rosmap import write_map
 
 PICTURES = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp")
 
@@ -24,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", help="YAML of a building, PLY of boxes or map.yaml of a ROS map; or a shipped name")
     parser.add_argument("--plot", type=_picture, metavar="OUT.png", help="draw walls, doors, rooms, tables and tours")
     parser.add_argument("--snapshot", type=_picture, metavar="OUT.png", help="render the populated world")
+    parser.add_argument("--map", type=_map, metavar="OUT.yaml", help="write its walls, doors open, as a ROS map")
     parser.add_argument("--scenario", default="easy", help="of the snapshot: a name or a file; default: easy")
     parser.add_argument("--tour", help="of the snapshot, or the only one to plot; default: the first, or all")
     parser.add_argument("--seed", type=int, default=1, help="of the snapshot; default: 1")
@@ -34,6 +36,15 @@ def _picture(text: str) -> Path:
     path = Path(text)
     if path.suffix.lower() not in PICTURES:
         raise argparse.ArgumentTypeError(f"{text!r} is no picture's name; it ends in one of {', '.join(PICTURES)}")
+    if not path.parent.is_dir():
+        raise argparse.ArgumentTypeError(f"there is no folder {path.parent}")
+    return path
+
+
+def _map(text: str) -> Path:
+    path = Path(text)
+    if path.suffix not in (".yaml", ".yml"):
+        raise argparse.ArgumentTypeError(f"{text!r} is no map's name; it ends in .yaml, and the image lies beside it")
     if not path.parent.is_dir():
         raise argparse.ArgumentTypeError(f"there is no folder {path.parent}")
     return path
@@ -61,6 +72,11 @@ def run(args: argparse.Namespace) -> int:
         draw_plan(building, args.plot, only=args.tour)
     if mistakes:
         return 2
+    if args.map is not None:
+        try:
+            write_map(building, args.map)
+        except BuildingError as error:
+            raise UserError(str(error)) from error
     if args.snapshot is not None:
         _snapshot(args, source, building)
     return 0

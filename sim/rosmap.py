@@ -1,4 +1,4 @@
-"""A ROS map (map.yaml and an image) as blocks of wall: its occupied cells, merged into rectangles."""
+"""ROS maps (map.yaml and an image): as blocks of wall, merged from their occupied cells; and of a building's walls."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ import numpy.typing as npt
 import yaml
 from scipy.ndimage import label
 
-from sim.building import Block, BuildingError
+from sim.building import Block, Building, BuildingError
+from sim.masonry import door_leaf, wall_bodies
+from sim.solids import Body
 
 Cells = npt.NDArray[np.bool_]
 
@@ -103,3 +105,46 @@ def rectangles(cells: Cells) -> list[tuple[int, int, int, int]]:
             start, rows = growing.get(run, (row, 0))
             growing[run] = start, rows + 1
     return sorted(found)
+
+
+def write_map(building: Building, path: Path, resolution: float = 0.05, height: float = 1.0) -> None:
+    """Write map.yaml and a PGM beside it: a building's walls at a height in metres, doors open, no furniture.
+
+    Cells that walls and closed doors shut off from the border are free, others unknown. Raises BuildingError.
+    """
+    x0, y0, x1, y1 = building.bounds()
+    margin = 10 * resolution
+    low = np.array([x0, y0]) - margin
+    columns, rows = (math.ceil(round(side / resolution, 6)) + 20 for side in (x1 - x0, y1 - y0))
+    walls = _drawn(wall_bodies(building), low, (rows, columns), resolution, height)
+    leaves = [door_leaf(building, index, 0.0) for index in range(len(building.doors))]
+    shut = walls | _drawn(leaves, low, (rows, columns), resolution, height)
+    parts, _ = label(~shut)
+    outer = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
+    unknown = ~walls & ~shut & np.isin(parts, outer)
+    if not (~walls & ~unknown).any():
+        raise BuildingError(f"building {building.name}: its walls enclose no free floor, so no map can be drawn")
+    shades = np.where(walls, 0, np.where(unknown, 205, 254)).astype(np.uint8)  # as map_saver of ROS
+    image = path.with_suffix(".pgm")
+    image.write_bytes(f"P5\n{columns} {rows}\n255\n".encode() + shades[::-1].tobytes())
+    info = RosMap(image.name, resolution, (round(float(low[0]), 6), round(float(low[1]), 6), 0.0), negate=0)
+    path.write_text(yaml.safe_dump(msgspec.to_builtins(info) | {"origin": list(info.origin)}, sort_keys=False), "utf-8")
+
+
+def _drawn(
+    bodies: list[Body], low: npt.NDArray[np.float64], shape: tuple[int, int], cell: float, height: float
+) -> Cells:
+    """Return the cells whose centre lies in the ground plan of a part that reaches a height."""
+    taken = np.zeros(shape, np.bool_)
+    for part in (part for body in bodies for part in body.parts):
+        if abs(part.z - height) > part.dz / 2:
+            continue
+        corners = (part.footprint() - low) / cell - 0.5  # in cells, from the centre of cell 0
+        first = np.maximum(np.ceil(corners.min(0) - 1e-6).astype(int), 0)
+        last = np.minimum(np.floor(corners.max(0) + 1e-6).astype(int), np.array(shape[::-1]) - 1)
+        x, y = np.meshgrid(np.arange(first[0], last[0] + 1), np.arange(first[1], last[1] + 1))
+        inside = np.ones(x.shape, np.bool_)
+        for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            inside &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= -1e-6
+        taken[first[1] : last[1] + 1, first[0] : last[0] + 1] |= inside
+    return taken
