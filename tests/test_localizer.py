@@ -157,6 +157,21 @@ def test_a_frame_between_two_odometry_stamps_is_interpolated():
     assert np.linalg.norm((pose.world_from_base - between)[:2, 3]) < 0.01
 
 
+def test_stamps_that_come_twice_do_no_harm():
+    localizer = Localizer()
+    drive(localizer, 5)
+    for _ in range(2):
+        localizer.on_odometry(odometry(5))
+        pose = localizer.on_frame(frame(5)).pose
+        assert pose.valid
+        assert distance(pose, 5) < 0.05
+    localizer.on_odometry(odometry(3))  # older than what is known: the robot is where the last word says
+    localizer.on_odometry(odometry(6))
+    pose = localizer.on_frame(frame(6)).pose
+    assert pose.valid
+    assert distance(pose, 6) < 0.05
+
+
 def test_a_frame_after_the_last_odometry_is_carried_and_still_aligned():
     localizer = Localizer()
     drive(localizer, 5)

@@ -112,6 +112,18 @@ def test_an_initial_map_comes_before_all_frames_and_keeps_its_points():
     assert sorted(map(tuple, again.points)) == sorted(map(tuple, voxels.points))
 
 
+def test_the_points_of_an_initial_map_lie_in_memory_as_in_space():
+    points, normals, scores = cloud(4000, 1.5, 3)
+    points[::50] = np.nan
+    points[1::50] = 1e9
+    voxels = VoxelMap(0.03)
+    voxels.insert_map(MapPoints(points, normals, scores))
+    blocks = np.floor(voxels.points.astype(np.float64) / 0.12).astype(int)
+    wanted = np.lexsort((*blocks.T[::-1], *(blocks // 8).T[::-1]))
+    assert wanted.tolist() == list(range(len(voxels)))
+    assert 3500 < len(voxels) <= 3840
+
+
 def test_a_voxel_has_a_size():
     with pytest.raises(ValueError, match="above 0"):
         VoxelMap(0.0)

@@ -67,7 +67,7 @@ def find_ground(
 
     points, normals: (n, 3) with z up. tolerance: of an inlier, metres. Returns (a, b, c), or None if fewer than 30
     points agree. A table top does not win: below a plane that was found the search goes on, and a lower plane is taken
-    if it has a tenth of the inliers. The lowest: a table top must not be taken for the floor.
+    if it has a tenth of the inliers.
     """
     level = np.abs(normals[:, 2]) > math.cos(LARGEST_TILT)
     x, y, z = np.ascontiguousarray(points[level].astype(np.float64).T)

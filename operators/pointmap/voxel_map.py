@@ -6,9 +6,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from operators.pointmap.nearest import nearest
-from operators.pointmap.store import BLOCK_VOXELS, CELL_BLOCKS, NONE, NORMAL, SCORE, empty_store, insert, with_room
+from operators.pointmap.store import (
+    BLOCK_BITS,
+    BLOCK_VOXELS,
+    CELL_BITS,
+    CELL_BLOCKS,
+    FARTHEST,
+    NONE,
+    NORMAL,
+    SCORE,
+    empty_store,
+    insert,
+    voxel_of,
+    with_room,
+)
 
 Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]
@@ -33,10 +47,22 @@ class MapPoints(NamedTuple):
         return MapPoints(self.points[chosen], self.normals[chosen], self.scores[chosen], movable, label)
 
 
-def cell_order(points: Floats, edge: float) -> npt.NDArray[np.int64]:
-    """Return the order that puts points (n, 3) of one cube of `edge` metres beside each other; keeps ties in order."""
-    cells = np.floor(points.astype(np.float64) / edge).astype(np.int64)
-    return np.lexsort((cells[:, 2], cells[:, 1], cells[:, 0]))
+@njit(cache=True, error_model="numpy")
+def places(points: Floats, voxel: float) -> npt.NDArray[np.int64]:
+    """Return a number (n,) for each point (n, 3) that rises with its cell, and in it with its block, along x, y, z.
+
+    voxel: metres. Points without a place, which no map takes, come last.
+    """
+    result = np.full(len(points), np.iinfo(np.int64).max, np.int64)
+    half, blocks = FARTHEST >> (BLOCK_BITS + CELL_BITS), CELL_BLOCKS - 1
+    for n in range(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        if not (abs(x) < FARTHEST * voxel and abs(y) < FARTHEST * voxel and abs(z) < FARTHEST * voxel):
+            continue
+        i, j, k = voxel_of(x, y, z, BLOCK_VOXELS * voxel)
+        cell = (((i >> CELL_BITS) + half) * 2 * half + (j >> CELL_BITS) + half) * 2 * half + (k >> CELL_BITS) + half
+        result[n] = ((cell * CELL_BLOCKS + (i & blocks)) * CELL_BLOCKS + (j & blocks)) * CELL_BLOCKS + (k & blocks)
+    return result
 
 
 class VoxelMap:
@@ -85,9 +111,7 @@ class VoxelMap:
 
         Returns which points of the cloud were kept (k,), in the order of their new numbers: the first of each voxel.
         """
-        block, cell = BLOCK_VOXELS * self.voxel_size, CELL_BLOCKS * BLOCK_VOXELS * self.voxel_size
-        order = cell_order(cloud.points, block)
-        order = order[cell_order(cloud.points[order], cell)]
+        order = np.argsort(places(np.ascontiguousarray(cloud.points, np.float32), self.voxel_size), kind="stable")
         before = len(self)
         self.insert(cloud.points[order], cloud.normals[order], cloud.scores[order], INITIAL)
         if len(self) - before == len(order):
