@@ -23,7 +23,7 @@ from operators.navigation.search import UNREACHED, Field
 STEP = 0.1  # seconds between the poses of an arc: one period of the controller
 COMFORT = 0.3  # metres of room from which passing costs nothing
 CLOSE_COST = 6.0  # seconds for each second's way at full speed with no room at all
-SLACK = 0.015  # metres that a corner may come nearer when the robot turns away from what it nearly touches
+TOUCHING, SLACK = 0.02, 0.02  # metres of room: with less, a corner may come nearer by this, or nothing would move
 CREEP, SPEED_PER_ROOM = 0.3, 3.0  # m/s with no room, and m/s more for each metre of it
 HASTE_COST = 4.0  # seconds a second, at twice the speed that the room allows
 TURN_COST = 1.3  # of the time that a turn towards the way takes: above 1, or the robot would never begin to turn
@@ -111,6 +111,14 @@ def seconds_left(way: Way, x: float, y: float) -> float:
                     total += part * value
                     share += part
     return total / share if share > 1e-6 else NOWHERE
+
+
+@njit(cache=True)
+def least_room(padding: float, here: float) -> float:
+    """Return the room that an arc must leave: who already stands closer may leave, not come closer still."""
+    if here < TOUCHING:
+        return here - SLACK
+    return min(padding, here)
 
 
 @njit(cache=True)
@@ -214,7 +222,7 @@ def _choose(
     poses[0, 0], poses[0, 1], poses[0, 2] = start
     speeds[0], turns[0] = speed_now, turn_now
     here = room(around, body, COMFORT, start[0], start[1], start[2])
-    needed = min(padding, here - SLACK)  # who already stands closer may leave, not come closer still
+    needed = least_room(padding, here)
     best, best_speed, best_turn = math.inf, 0.0, 0.0
     trajectory = poses[:1].copy()
     for i in range(len(speeds_wanted)):
@@ -290,7 +298,7 @@ class DynamicWindow:
     def free_steps(self, pose: tuple[float, float, float], twist: Twist, around: Surroundings, steps: int) -> int:
         """Count the controller's periods for which a constant twist touches nothing, up to `steps`."""
         x, y, yaw = pose
-        needed = min(self.padding, room(around, self._body, COMFORT, x, y, yaw) - SLACK)
+        needed = least_room(self.padding, room(around, self._body, COMFORT, x, y, yaw))
         for step in range(steps):
             x, y, yaw = advance(x, y, yaw, twist.linear, twist.angular, STEP)
             if room(around, self._body, COMFORT, x, y, yaw) < needed:
