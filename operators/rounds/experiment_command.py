@@ -294,13 +294,13 @@ class Experiment:
         graph, recording = target.with_suffix(".yaml"), target.with_suffix(".mcap")
         content = listening_graph(
             self.graph_of(session),
+            self.relative(self.place(session, ".mcap")),
             labels,
             weights=None if weights is None else self.relative(weights),
             threads=self.settings.threads,
         )
         graph.write_text(written(content, f"{session.name} heard again with {name}"))
-        source = self.place(session, ".mcap")
-        record = record_of(session, launch(graph, recording, source=source), recording)
+        record = record_of(session, launch(graph, recording), recording)
         write_json(target, {**record, "group": name})
         recording.unlink()
         return f"{target.stem}: error {np.median(record['errors_mm']):.1f} mm"

@@ -46,11 +46,10 @@ def verb(arguments: Sequence[str | Path], log: Path, *, threads: int = 1) -> str
     return done.stdout
 
 
-def launch(graph: Path, recording: Path, *, source: Path | None = None) -> dict[str, Any]:
-    """Launch a graph file and return its outcome; with the simulator of a recording, if one is given."""
+def launch(graph: Path, recording: Path) -> dict[str, Any]:
+    """Launch a graph file and return its outcome."""
     recording.unlink(missing_ok=True)
-    stand_in: list[str | Path] = [] if source is None else ["--from", source, "--sources", "simulator"]
-    arguments: list[str | Path] = ["launch", graph, "--record", recording, "--quiet", "--json", *stand_in]
+    arguments: list[str | Path] = ["launch", graph, "--record", recording, "--quiet", "--json"]
     outcome: dict[str, Any] = json.loads(verb(arguments, recording.with_suffix(".log")))
     return outcome
 

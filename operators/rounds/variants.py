@@ -14,6 +14,7 @@ ROBOT = Path(__file__).parent / "robot.yaml"
 
 Graph = dict[str, Any]  # a graph file's content
 
+PLAYBACK = "graph.playback:operators.simulator.Simulator"
 SEGMENTERS = {"network": "operators.segmenter:Segmenter", "truth": "operators.segmenter:TrueSegmenter"}
 
 
@@ -77,19 +78,23 @@ def without_tracker(graph: Graph) -> None:
 
 
 def listening_graph(
-    graph: Graph, labels: str, *, weights: str | None = None, threads: int = 1, voxel: float = 0.08
+    graph: Graph, recording: str, labels: str, *, weights: str | None = None, threads: int = 1, voxel: float = 0.08
 ) -> Graph:
     """Return what localizes on a recording of a session: its simulator played back, these labels, the localizer.
 
-    graph: of the session.
+    graph: of the session. recording, weights: files as the graph file shall name them.
     """
     listening = copy.deepcopy(graph)
     operators = listening["operators"]
     whole = robot()["operators"]
     operators |= {name: copy.deepcopy(whole[name]) for name in ("segmenter", "triage")}
     without_tracker(listening)
-    del operators["planner"], operators["simulator"]["inputs"]["drive"]
-    operators["simulator"]["record"] = {"frame": "digest"}
+    del operators["planner"]
+    operators["simulator"] = {
+        "run": PLAYBACK,
+        "config": {"recording": recording, "operator": "simulator"},
+        "record": {"frame": "digest"},
+    }
     with_labels(listening, labels, weights=weights, threads=threads, voxel=voxel)
     names = [name for name in whole if name in operators]
     listening["operators"] = {name: operators[name] for name in names}
