@@ -16,7 +16,7 @@ from graph.geometry import wrap
 from operators.montecarlo.map_file import FREE, OCCUPIED, UNKNOWN, GridMap
 from operators.montecarlo.matching import climb, judge
 from operators.montecarlo.motion import Spread, compose, difference, shake
-from operators.montecarlo.patches import HITS, VISITS, Patches
+from operators.montecarlo.patches import Patches
 from operators.montecarlo.resampling import effective, systematic
 
 Doubles = npt.NDArray[np.float64]
@@ -35,7 +35,7 @@ class Settings(NamedTuple):
     iterations: int = 5
     lsigma: float = 0.075
     ogain: float = 3.0
-    lskip: int = 0  # beams left out between two that are matched
+    lskip: int = 2  # beams left out between two that are matched
     minimumScore: float = 0.0  # below, a match is not believed and odometry stands
     srr: float = 0.1
     srt: float = 0.2
@@ -152,10 +152,6 @@ class Gmapping:
 
     def grid(self, index: int | None = None) -> GridMap:
         """Return the map of a particle, by default of the best: 100 where enough beams ended, 0 where they passed."""
-        cells = self.patches.dense(self.best if index is None else index)
-        with np.errstate(invalid="ignore"):
-            taken = cells[..., HITS] > self.settings.occ_thresh * cells[..., VISITS]
-        seen = np.where(taken, OCCUPIED, FREE)
-        return GridMap(
-            np.where(cells[..., VISITS] > 0, seen, UNKNOWN).astype(np.int8), self.patches.origin, self.settings.delta
-        )
+        hits, visits = self.patches.dense(self.best if index is None else index)
+        seen = np.where(hits > self.settings.occ_thresh * visits, OCCUPIED, FREE)
+        return GridMap(np.where(visits > 0, seen, UNKNOWN).astype(np.int8), self.patches.origin, self.settings.delta)

@@ -8,11 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from operators.montecarlo.patches import BITS, HITS, SIDE, Store, X, Y
+from operators.montecarlo.patches import BITS, HITS, OFTEN, SIDE, Store, X, Y
 
 Doubles = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
-Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int32]
 
 BACK = math.sqrt(2.0)  # cells before an end point that should be free
@@ -39,7 +37,7 @@ def judge(
     (rows, columns) of one map.
     """
     scale, back = 1.0 / resolution, BACK * resolution
-    cells, full = store.cells, store.full
+    met, state = store.ends, store.state
     height, width = directory.shape[0] << BITS, directory.shape[1] << BITS
     cosine, sine = math.cos(pose[2]) * scale, math.sin(pose[2]) * scale
     px, py = pose[0] * scale, pose[1] * scale
@@ -59,14 +57,14 @@ def judge(
                 for x in range(cx - kernel, cx + kernel + 1):
                     patch = directory[y >> BITS, x >> BITS]
                     place = ((y & (SIDE - 1)) << BITS) | (x & (SIDE - 1))
-                    if not full[patch, place]:
+                    if state[patch, place] != OFTEN:
                         continue
                     v, u = y + fy, x + fx
-                    if full[directory[v >> BITS, u >> BITS], ((v & (SIDE - 1)) << BITS) | (u & (SIDE - 1))]:
+                    if state[directory[v >> BITS, u >> BITS], ((v & (SIDE - 1)) << BITS) | (u & (SIDE - 1))] == OFTEN:
                         continue
-                    hits = cells[patch, place, HITS]
-                    dx = (ex - x) * resolution - cells[patch, place, X] / hits
-                    dy = (ey - y) * resolution - cells[patch, place, Y] / hits
+                    hits = met[patch, place, HITS]
+                    dx = (ex - x) * resolution - met[patch, place, X] / hits
+                    dy = (ey - y) * resolution - met[patch, place, Y] / hits
                     gap = min(gap, dx * dx + dy * dy)
         if logarithmic:
             total += -gap / sigma if gap < FAR else NO_HIT

@@ -27,8 +27,9 @@ HITS, VISITS, X, Y = (
 class Store(NamedTuple):
     """The arrays of all maps; patch 0 is the empty one, never written."""
 
-    cells: Floats  # (patches, SIDE * SIDE, 4)
-    full: npt.NDArray[np.bool_]  # (patches, SIDE * SIDE) whether enough beams ended there
+    ends: Floats  # (patches, SIDE * SIDE, 3)
+    visits: Floats  # (patches, SIDE * SIDE) beams that met the cell; apart, as rays touch little else
+    state: npt.NDArray[np.uint8]  # (patches, SIDE * SIDE) NEVER, SELDOM or OFTEN
     users: Ints  # (patches,) maps that show the patch
     free: Ints  # (patches,) stack of unused patches
     top: Ints  # (1,) height of the stack
@@ -76,7 +77,8 @@ class Patches:
             return
         count = len(store.users)
         larger = _store(count + max(missing, count // 2))
-        larger.cells[:count], larger.full[:count], larger.users[:count] = store.cells, store.full, store.users
+        for old, new in zip(store[:4], larger[:4], strict=True):
+            new[:count] = old
         added = np.arange(len(larger.users) - 1, count - 1, -1, dtype=np.int32)
         top = int(store.top[0])
         larger.free[: len(added)] = added
@@ -100,11 +102,15 @@ class Patches:
         self.reserve(int(spread[0] * spread[1]))
         _enter(self.directory[index], self.store, sensor - self.origin, ends - self.origin, hits, self.resolution)
 
-    def dense(self, index: int) -> Floats:
-        """Return one map's cells (rows, columns, 4), as the store keeps them."""
+    def dense(self, index: int) -> tuple[Floats, Floats]:
+        """Return how many beams ended in each cell of one map and how many met it, each (rows, columns)."""
         _, rows, columns = self.directory.shape
-        patches = self.store.cells[self.directory[index]].reshape(rows, columns, SIDE, SIDE, 4)
-        return np.ascontiguousarray(patches.transpose(0, 2, 1, 3, 4)).reshape(rows * SIDE, columns * SIDE, 4)
+        places = self.directory[index]
+        both = []
+        for values in (self.store.ends[places, :, HITS], self.store.visits[places]):
+            tiles = values.reshape(rows, columns, SIDE, SIDE).transpose(0, 2, 1, 3)
+            both.append(np.ascontiguousarray(tiles).reshape(rows * SIDE, columns * SIDE))
+        return both[0], both[1]
 
     def in_use(self) -> int:
         """Return how many patches all maps need together."""
@@ -113,8 +119,9 @@ class Patches:
 
 def _store(count: int) -> Store:
     store = Store(
-        np.zeros((count, SIDE * SIDE, 4), np.float32),
-        np.zeros((count, SIDE * SIDE), np.bool_),
+        np.zeros((count, SIDE * SIDE, 3), np.float32),
+        np.zeros((count, SIDE * SIDE), np.float32),
+        np.zeros((count, SIDE * SIDE), np.uint8),
         np.zeros(count, np.int32),
         np.zeros(count, np.int32),
         np.array([count - 1], np.int32),
@@ -147,9 +154,10 @@ def _own(directory: Ints, store: Store, row: int, column: int) -> int:
     store.top[0] -= 1
     own = store.free[store.top[0]]
     for place in range(SIDE * SIDE):
-        store.full[own, place] = store.full[patch, place]
-        for value in range(4):
-            store.cells[own, place, value] = store.cells[patch, place, value]
+        store.state[own, place] = store.state[patch, place]
+        store.visits[own, place] = store.visits[patch, place]
+        for value in range(3):
+            store.ends[own, place, value] = store.ends[patch, place, value]
     if patch != 0:
         store.users[patch] -= 1
     store.users[own] = 1
@@ -162,7 +170,7 @@ def _enter(
     directory: Ints, store: Store, sensor: Doubles, ends: Doubles, hits: npt.NDArray[np.bool_], resolution: float
 ) -> None:
     """Count a visit of each cell along each beam (Bresenham 1965), and the hit at its end."""
-    scale, cells, full = 1.0 / resolution, store.cells, store.full
+    scale, met, visits, state = 1.0 / resolution, store.ends, store.visits, store.state
     x0, y0 = math.floor(sensor[0] * scale), math.floor(sensor[1] * scale)
     for beam in range(len(ends)):
         ex, ey = ends[beam, 0] * scale, ends[beam, 1] * scale
@@ -180,13 +188,15 @@ def _enter(
                 patch = _own(directory, store, row, column)
                 last_row, last_column = row, column
             place = ((y & (SIDE - 1)) << BITS) | (x & (SIDE - 1))
-            cells[patch, place, VISITS] += np.float32(1.0)
+            visits[patch, place] += np.float32(1.0)
             if x == x1 and y == y1 and hits[beam]:
-                cells[patch, place, HITS] += np.float32(1.0)
-                cells[patch, place, X] += np.float32((ex - x1) * resolution)
-                cells[patch, place, Y] += np.float32((ey - y1) * resolution)
-            if cells[patch, place, HITS] > 0.0:
-                full[patch, place] = cells[patch, place, HITS] > FULL * cells[patch, place, VISITS]
+                met[patch, place, HITS] += np.float32(1.0)
+                met[patch, place, X] += np.float32((ex - x1) * resolution)
+                met[patch, place, Y] += np.float32((ey - y1) * resolution)
+                state[patch, place] = SELDOM
+            if state[patch, place] != NEVER:
+                often = met[patch, place, HITS] > FULL * visits[patch, place]
+                state[patch, place] = OFTEN if often else SELDOM
             twice = 2 * error
             if twice > -dy:
                 error -= dy

@@ -1,4 +1,4 @@
-"""Make a session of anyone's scans: a folder of files, a Velodyne capture or a ROS bag, with poses or odometry.
+"""Make a session of anyone's scans: files, a Velodyne capture, a CARMEN log or a ROS bag, with poses or odometry.
 
 retracer import sequences/00/velodyne -o kitti00.mcap --poses 00.txt --poses-of lidar --lidar-height 1.73
 """
@@ -34,7 +34,12 @@ OPTIONS = [name for name in Settings.__struct_fields__ if name != "folder"]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `retracer import`; each option is a setting of the Source."""
-    parser.add_argument("folder", type=Path, metavar="DIR", help="a folder of scans, a .pcap file, or a ROS bag")
+    parser.add_argument(
+        "folder",
+        type=Path,
+        metavar="DIR",
+        help="a folder of scans, a .pcap file, a CARMEN log (.clf, .log, also .gz, .bz2), or a ROS bag",
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="SESSION.mcap")
     scans = parser.add_argument_group("scans")
     scans.add_argument("--pattern", metavar="GLOB", help="which files of the folder; default: all scans")

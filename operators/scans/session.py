@@ -13,6 +13,7 @@ import numpy as np
 
 from graph.geometry import Matrix, exponential, inverse
 from operators.scans.bag import BagScans, bag_files
+from operators.scans.carmen import CarmenScans, is_log
 from operators.scans.folder import FolderScans, Scans
 from operators.scans.packets import PacketScans
 from operators.scans.poses import read_calibration, read_poses
@@ -206,7 +207,7 @@ class Session:
 
 
 def open_scans(settings: Settings) -> Scans:
-    """Open what the settings point at: a folder of scan files, a .pcap, or a bag. Raises ScanError."""
+    """Open what the settings point at: a folder of scan files, a .pcap, a CARMEN log, or a bag. Raises ScanError."""
     place = settings.folder
     if not place.exists():
         raise ScanError(f"{place}: no such file or folder")
@@ -228,10 +229,14 @@ def open_scans(settings: Settings) -> Scans:
             odom_frame=settings.odom_frame,
             base_frame=settings.base_frame,
         )
+    if place.is_file() and is_log(place):
+        return CarmenScans(place)
     if len(captures) == 1:
         return PacketScans(captures[0])
     if place.is_file():
-        raise ScanError(f"{place} is no folder of scans, no .pcap and no bag (.bag, .mcap, .db3)")
+        raise ScanError(
+            f"{place} is no folder of scans, no .pcap and no bag (.bag, .mcap, .db3), and no CARMEN log (.clf, .log)"
+        )
     return FolderScans(place, settings.pattern, stamps=settings.stamps, named=settings.rate is None)
 
 
