@@ -39,11 +39,11 @@ class Annotator(Operator):
 
         map: Path | None = None  # of the building, PLY; what it holds is permanent unless the session saw through it
         every: int = 10  # frames kept for labels: one of so many, 0.5 MB each
-        trace_known: int = 5  # one frame of so many looks at the points of the map too, for the dashboard
+        trace_known: int = 10  # one frame of so many looks at the points of the map too, for the dashboard
         period: float = 5.0  # seconds between two messages of the annotated map
         grain: float = 0.12  # metres between its points
         vertical_resolution: float = math.radians(1.33)  # between two beams of the lidar
-        frustum_width: float = math.radians(0.1)  # of the ray tracing
+        frustum_width: float = math.radians(0.15)  # of the ray tracing
 
     class Outputs(msgspec.Struct):
         """The map with movable probabilities now and then; the labelled frames at the end."""

@@ -35,6 +35,7 @@ class LabelledSession(Source):
         session: Path
         map: Path  # the refined one, PLY
         buffer: Path  # what the session saw besides, PLY with classes
+        apart: float = 0.0  # metres between the two, at least; makes the projection faster
         every: int = 1
         frames: str | None = None  # topic
         poses: Path | None = None  # of `save_poses`; None: those that the session's localizer said
@@ -52,7 +53,7 @@ class LabelledSession(Source):
         c = self.config
         self.tally = Tally()
         session = RecordedSession(c.session, frames=c.frames, known=None if c.poses is None else load_poses(c.poses))
-        projector = Projector(load_buffer(c.buffer, shared_map(c.map)))
+        projector = Projector(load_buffer(c.buffer, shared_map(c.map), c.apart))
         pending: tuple[int, Any] | None = None
         for cloud, scan in session.clouds(every=c.every):
             if not scan.valid:

@@ -47,7 +47,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--least-overlap", type=float, default=Acceptance().least_overlap, metavar="SHARE",
                         help="of what a session saw, that the map must have")  # fmt: skip
     parser.add_argument("--vertical-resolution", type=float, default=1.33, metavar="DEG", help="of the lidar")
-    parser.add_argument("--frustum-width", type=float, default=0.1, metavar="DEG", help="of the ray tracing")
+    parser.add_argument(
+        "--tau-short", type=float, default=Classing().short, metavar="P", help="shortT above; paper: 0.7"
+    )
+    parser.add_argument("--tau-long", type=float, default=Classing().long, metavar="P", help="longT below; paper: 0.4")
+    parser.add_argument("--frustum-width", type=float, default=0.15, metavar="DEG", help="of the ray tracing")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.add_argument("--json", action="store_true", help="print the outcome as JSON")
 
@@ -70,12 +74,16 @@ def run(args: argparse.Namespace) -> int:
 
 def job_of(args: argparse.Namespace) -> Job:
     """Check the command line. Raises UserError by name."""
-    for name, least in (("every", 1), ("workers", 1)):
-        if getattr(args, name) < least:
-            raise UserError(f"--{name} wants at least {least}; it was given {getattr(args, name)}")
+    for name in ("every", "workers"):
+        if getattr(args, name) < 1:
+            raise UserError(f"--{name} wants at least 1; it was given {getattr(args, name)}")
     for name, least in (("vertical-resolution", 0.1), ("frustum-width", 0.02)):
         if not least <= (given := getattr(args, name.replace("-", "_"))) <= 10.0:
             raise UserError(f"--{name} wants {least:g} to 10 degrees; it was given {given:g}")
+    if not 0.0 <= args.tau_long <= args.tau_short <= 1.0:
+        raise UserError(
+            f"--tau-long and --tau-short are probabilities in this order; given are {args.tau_long}, {args.tau_short}"
+        )
     names = [path.name for path in args.sessions]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise UserError(f"two sessions are named {twice[0]}; what comes out of them would be one file")
@@ -94,7 +102,7 @@ def job_of(args: argparse.Namespace) -> Job:
         align=args.align,
         acceptance=Acceptance(least_overlap=args.least_overlap),
         refinement=Refinement(),
-        classing=Classing(permanent=args.permanent),
+        classing=Classing(short=args.tau_short, long=args.tau_long, permanent=args.permanent),
         resolution=math.radians(args.vertical_resolution),
         width=math.radians(args.frustum_width),
     )

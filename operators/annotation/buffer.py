@@ -25,13 +25,16 @@ from operators.annotation.session import (
 from operators.pointmap import MapPoints, PointMap, VoxelMap, find_ground, height_above
 from operators.pointmap import Settings as MapSettings
 from operators.pointray import PointRay, RaySettings
+from operators.pointray.looks import FREE
+
+POOL = 0.09  # metres: three voxels
 
 
 class Classing(NamedTuple):
     """How probabilities become classes."""
 
-    short: float = 0.7  # movable above
-    long: float = 0.4  # movable below, but not part of the map
+    short: float = 0.6  # movable above; paper: 0.7
+    long: float = 0.5  # movable below, but not part of the map; paper: 0.4
     ground: float = 0.05  # metres from the plane; the truth of simulators ends there too
     clearance: float = 0.01
     apart: float = 0.04  # metres from the known map: what is nearer is the known surface, measured with noise
@@ -76,6 +79,7 @@ class Buffer(NamedTuple):
     known: KnownMap
     known_labels: Labels  # (n,)
     new: MapPoints  # with movable and label
+    apart: float  # metres between any new point and the nearest known one, at least
 
 
 def new_points(
@@ -114,7 +118,27 @@ def trace_new(new: VoxelMap, session: Session, rays: RaySettings) -> Floats:
     for scan in session:
         if scan.valid:
             tracer.add(scan.points, scan.world_from_lidar)
-    return tracer.movable()
+    return pooled(tracer)
+
+
+def pooled(tracer: PointRay, edge: float = POOL) -> Floats:
+    """Return movable probabilities (k,); points that were hardly looked at take that of their surroundings.
+
+    edge: of the cubes whose looks are put together where a point's own are too few, metres. People pass quickly: of one
+    point of them there may be five looks, of the nine around it fifty.
+    """
+    movable, looks = tracer.movable(), tracer.looks()
+    few = looks < tracer.settings.least_looks
+    if not few.any():
+        return movable
+    cells = np.floor(tracer.voxels.points / edge).astype(np.int64)
+    keys = (cells[:, 0] << 42) ^ ((cells[:, 1] & 0x1FFFFF) << 21) ^ (cells[:, 2] & 0x1FFFFF)
+    _, cube = np.unique(keys, return_inverse=True)
+    free = tracer.counts[: len(looks), FREE]
+    looks_of, free_of = np.bincount(cube, looks), np.bincount(cube, free)
+    told = few & (looks_of[cube] >= tracer.settings.least_looks)
+    movable[told] = (free_of[cube[told]] / looks_of[cube[told]]).astype(np.float32)
+    return movable
 
 
 def classify(known: KnownMap, new: MapPoints, settings: Classing | None = None) -> Buffer:
@@ -137,7 +161,7 @@ def classify(known: KnownMap, new: MapPoints, settings: Classing | None = None) 
     if known.plane is not None:
         floor = np.abs(height_above(known.plane, new.points)) < settings.ground
         labels[floor] = GROUND
-    return Buffer(known, known_labels, new._replace(label=labels))
+    return Buffer(known, known_labels, new._replace(label=labels), settings.apart)
 
 
 def subset(cloud: MapPoints, chosen: Booleans) -> VoxelMap:

@@ -34,8 +34,11 @@ def save_buffer(path: Path, buffer: Buffer) -> None:
             np.save(file, buffer.known_labels)
 
 
-def load_buffer(path: Path, known: KnownMap) -> Buffer:
-    """Read what `save_buffer` wrote. A session that saw nothing new has no points."""
+def load_buffer(path: Path, known: KnownMap, apart: float = 0.0) -> Buffer:
+    """Read what `save_buffer` wrote. A session that saw nothing new has no points.
+
+    apart: metres between its points and the nearest known one, at least, as far as that is known.
+    """
     columns = read_ply(path)
     new = MapPoints(
         np.stack([columns[name] for name in ("x", "y", "z")], axis=1),
@@ -45,4 +48,4 @@ def load_buffer(path: Path, known: KnownMap) -> Buffer:
         columns["class"],
     )
     beside = path.with_suffix(".npy")
-    return Buffer(known, np.load(beside) if beside.exists() else known.labels, new)
+    return Buffer(known, np.load(beside) if beside.exists() else known.labels, new, apart)

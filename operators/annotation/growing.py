@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from operators.annotation.buffer import Buffer, Classing, classify, enter_new, known_map
+from operators.annotation.buffer import Buffer, Classing, classify, enter_new, known_map, pooled
 from operators.annotation.refinement import Refinement, refine
 from operators.annotation.session import Floats, Scan
 from operators.pointmap import MapPoints, PointMap, Settings, VoxelMap
@@ -56,6 +56,7 @@ class GrowingBuffer:
             np.concatenate([gone.points, new.points]),
             np.concatenate([gone.normals, new.normals]),
             np.concatenate([gone.scores, new.scores]),
-            np.concatenate([movable[~stays], self.new_rays.movable()]),
+            np.concatenate([movable[~stays], pooled(self.new_rays)]),
         )
-        return classify(known_map(refined, self.classing), together, self.classing)
+        # What was known and is gone lies beside what is left: known and new are not apart.
+        return classify(known_map(refined, self.classing), together, self.classing)._replace(apart=0.0)

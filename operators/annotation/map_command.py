@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--voxel", type=float, default=0.03, metavar="M", help="one point of the map a voxel")
     parser.add_argument("--threshold", type=float, default=0.7, help="movable probability beyond which points go")
     parser.add_argument("--vertical-resolution", type=float, default=1.33, metavar="DEG", help="of the lidar")
-    parser.add_argument("--frustum-width", type=float, default=0.1, metavar="DEG", help="of the ray tracing")
+    parser.add_argument("--frustum-width", type=float, default=0.15, metavar="DEG", help="of the ray tracing")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.add_argument("--json", action="store_true", help="print the outcome as JSON")
 

@@ -22,6 +22,8 @@ class Projector:
         self.known, self.known_labels = buffer.known.voxels, buffer.known_labels
         self.new = VoxelMap(self.known.voxel_size)
         self.new_labels: Labels = buffer.new.label[self.new.insert_map(buffer.new)]
+        # A point nearer to the known than half of what lies between known and new has no new point nearer still.
+        self.apart = buffer.apart
 
     def project(self, scan: Scan) -> Labels:
         """Return the class (n,) of each point of a frame: that of the nearest point of the buffer."""
@@ -31,7 +33,8 @@ class Projector:
         near = found >= 0
         labels[near] = self.known_labels[found[near]]
         if len(self.new):
-            nearer, gap = self.new.nearest(world, REACH)
-            wins = (nearer >= 0) & (gap < distance)
-            labels[wins] = self.new_labels[nearer[wins]]
+            doubtful = np.flatnonzero(distance >= 0.5 * self.apart)
+            nearer, gap = self.new.nearest(world[doubtful], REACH)
+            wins = (nearer >= 0) & (gap < distance[doubtful])
+            labels[doubtful[wins]] = self.new_labels[nearer[wins]]
         return labels

@@ -28,7 +28,7 @@ from operators.pointmap import MapPoints, Settings, VoxelMap, load_map
 from operators.pointray import RaySettings
 from operators.recorded_session import Known, RecordedSession, load_poses, save_poses
 
-VERSION = 1  # of what the stages leave behind; another one makes everything anew
+VERSION = 2  # of what the stages leave behind; another one makes everything anew
 ANNOTATOR = "annotator"  # the operator of a labelled recording
 LEAST_POSES = 0.9  # share of the frames that must have a pose
 
@@ -200,6 +200,7 @@ def write_frames(job: Job, path: Path, buffer: Path, record: Path) -> None:
     partial = record.with_name(f"{path.stem}.partial.mcap")
     partial.unlink(missing_ok=True)
     config: dict[str, Any] = {"session": str(path), "map": str(job.map), "buffer": str(buffer), "every": job.every}
+    config["apart"] = job.classing.apart
     if job.frames is not None:
         config["frames"] = job.frames
     if (aligned := job.work / f"{path.stem}.poses.npz").exists():
