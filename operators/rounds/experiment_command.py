@@ -78,6 +78,7 @@ class Experiment:
             if number < self.settings.rounds or self.settings.rounds == 1:
                 self.annotate(number)
                 self.train(number)
+            self.drop(self.schedule.round(number))
             self.report()
         self.drive(self.schedule.truth())
         self.drive(self.schedule.predict())
@@ -230,7 +231,6 @@ class Experiment:
                 write_json(done, told)
         for left in ("work", "buffers"):
             shutil.rmtree(target / left, ignore_errors=True)
-        self.drop(sessions)
 
     def train(self, number: int) -> None:
         """Train a network afresh on all that was labelled so far; none where nothing was."""

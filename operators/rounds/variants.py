@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,15 @@ PLAYBACK = "graph.playback:operators.simulator.Simulator"
 SEGMENTERS = {"network": "operators.segmenter:Segmenter", "truth": "operators.segmenter:TrueSegmenter"}
 
 
-def robot() -> Graph:
-    """Read the whole robot."""
+@functools.cache
+def _read() -> Graph:
     graph: Graph = yaml.safe_load(ROBOT.read_text(encoding="utf-8"))
     return graph
+
+
+def robot() -> Graph:
+    """Return the whole robot, each time another copy."""
+    return copy.deepcopy(_read())
 
 
 def session_graph(
@@ -87,7 +93,7 @@ def listening_graph(
     listening = copy.deepcopy(graph)
     operators = listening["operators"]
     whole = robot()["operators"]
-    operators |= {name: copy.deepcopy(whole[name]) for name in ("segmenter", "triage")}
+    operators |= {name: whole[name] for name in ("segmenter", "triage")}
     without_tracker(listening)
     del operators["planner"]
     operators["simulator"] = {
