@@ -16,12 +16,8 @@ Ints = npt.NDArray[np.int32]
 BITS = 5
 SIDE = 1 << BITS  # cells along a patch
 FULL = 0.1  # share of hits from which a cell counts as occupied when scans are matched
-HITS, VISITS, X, Y = (
-    0,
-    1,
-    2,
-    3,
-)  # of a cell: end points in it, beams that met it, sums of the end points' offsets (metres)
+HITS, X, Y = 0, 1, 2  # of a cell: end points in it, and the sums of their offsets (metres)
+NEVER, SELDOM, OFTEN = 0, 1, 2  # how many of the beams that met a cell ended there
 
 
 class Store(NamedTuple):
