@@ -75,7 +75,10 @@ def _ray(address: str) -> Iterator[Crew]:
     except ImportError:
         raise UserError("--ray wants Ray, which is not installed: pip install 'retracer[ray]'") from None
     try:
-        ray.init(address=None if address == "local" else address, logging_level="error", include_dashboard=False)
+        if address == "local":
+            ray.init(logging_level="error", include_dashboard=False)
+        else:
+            ray.init(address=address, logging_level="error")
     except Exception as error:
         raise UserError(f"--ray {address}: no Ray cluster answers there: {error}") from None
 
