@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from test_pointmap_room import BASE_FROM_LIDAR, BOXES, ROOM, scan
 
 from graph.geometry import planar, transform
-from operators.pointmap.angles import spherical
+from operators.pointmap.angles import logarithms, spherical
 from operators.pointmap.eigen import smallest_direction
 from operators.pointmap.frame import prepare
 from operators.pointmap.normals import bin_directions, decay, estimate_normals, trust
@@ -30,6 +30,13 @@ def test_spherical_coordinates_agree_with_numpy_in_all_octants():
     assert np.abs(rho - np.sqrt(x**2 + y**2 + z**2)).max() < 1e-6
     assert np.abs(theta - np.arctan2(z, np.hypot(x, y))).max() < 2e-7
     assert np.abs(phi - np.arctan2(y, x)).max() < 3e-7
+
+
+def test_logarithms_are_those_of_numpy():
+    numbers = np.exp(np.random.default_rng(0).uniform(-3, 7, 5000)).astype(np.float32)
+    numbers[:3] = 1.0, 2.0, 0.05
+    assert np.abs(logarithms(numbers) - np.log(numbers.astype(np.float64))).max() < 1e-6
+    assert len(logarithms(numbers[:0])) == 0
 
 
 def twin_of_central_points(points, size):

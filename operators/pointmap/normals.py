@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from operators.pointmap.angles import logarithms
 from operators.pointmap.eigen import smallest_direction
 
 Floats = npt.NDArray[np.float32]
@@ -23,17 +24,15 @@ ROWS_PER_RADIUS, COLUMNS_PER_RADIUS = 1.5, 8.0  # a row is as high as beams are 
 
 # Single precision throughout: a constant in double precision would convert every operand of the innermost loop.
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
-THIRD, FIFTH = np.float32(1.0 / 3.0), np.float32(0.2)
 TURN = np.float32(2.0 * math.pi)
 ACROSS = np.float32(AZIMUTH_SCALE)
-ALONG = np.float32(2.0 / RANGE_SCALE)
 
 
 class Bins(NamedTuple):
     """The points of a frame, sorted by elevation row and azimuth column."""
 
     first: Ints  # (rows * columns + 1,) start of each bin among the sorted
-    points: Floats  # (n, 6) sorted: x y z, range, elevation, azimuth
+    points: Floats  # (n, 6) sorted: x y z, depth (log range over 8), elevation, azimuth
     rows: int
     columns: int
     lowest: float  # elevation of the lower edge of row 0
@@ -56,7 +55,7 @@ def number_bins(
 
 
 @njit(cache=True, error_model="numpy")
-def bin_directions(x: Floats, y: Floats, z: Floats, rho: Floats, theta: Floats, phi: Floats, radius: float) -> Bins:
+def bin_directions(x: Floats, y: Floats, z: Floats, depth: Floats, theta: Floats, phi: Floats, radius: float) -> Bins:
     """Sort points (n,) by direction into rows of 2/3 of the radius and columns of an eighth of it; keeps their order.
 
     The lowest beam runs through the middle of its row, and so do all others of a lidar with even beams.
@@ -81,19 +80,19 @@ def bin_directions(x: Floats, y: Floats, z: Floats, rho: Floats, theta: Floats, 
         place = first[bins[i] + 1]
         first[bins[i] + 1] = place + 1
         points[place, 0], points[place, 1], points[place, 2] = x[i], y[i], z[i]
-        points[place, 3], points[place, 4], points[place, 5] = rho[i], theta[i], phi[i]
+        points[place, 3], points[place, 4], points[place, 5] = depth[i], theta[i], phi[i]
     return Bins(first[:-1], points, rows, columns, lowest, height, width)
 
 
 @njit(cache=True, error_model="numpy")
 def covariances(
-    x: Floats, y: Floats, z: Floats, rho: Floats, theta: Floats, phi: Floats, chosen: Ints, radius: float
+    x: Floats, y: Floats, z: Floats, depth: Floats, theta: Floats, phi: Floats, chosen: Ints, radius: float
 ) -> Floats:
     """Return xx xy xz yy yz zz (6, m) of the neighbours of the chosen points; zeros where fewer than 4 are near.
 
     The innermost loop weighs by 0 or 1 instead of branching: which neighbours are near cannot be predicted.
     """
-    first, points, rows, columns, lowest, height, width = bin_directions(x, y, z, rho, theta, phi, radius)
+    first, points, rows, columns, lowest, height, width = bin_directions(x, y, z, depth, theta, phi, radius)
     result = np.zeros((6, len(chosen)), np.float32)
     spread = min(int(radius / AZIMUTH_SCALE / width) + 1, (columns - 1) // 2)
     per_height, per_width = 1.0 / height, 1.0 / width
@@ -102,7 +101,7 @@ def covariances(
     for k in range(len(chosen)):
         i = chosen[k]
         px, py, pz = x[i], y[i], z[i]
-        r, t, f = rho[i], theta[i], phi[i]
+        d, t, f = depth[i], theta[i], phi[i]
         low = max(0, math.floor((t - reach - lowest) * per_height))
         high = min(rows - 1, math.floor((t + reach - lowest) * per_height))
         centre = min(columns - 1, int((f + math.pi) * per_width))
@@ -118,10 +117,8 @@ def covariances(
                 elif part == 1:
                     a, b, g = 0, right - columns, f - TURN
                 for j in range(first[row * columns + a], first[row * columns + b + 1]):
-                    dt, df = points[j, 4] - t, ACROSS * (points[j, 5] - g)
-                    u = (points[j, 3] - r) / (points[j, 3] + r)  # log(a / b) = 2 atanh((a - b) / (a + b))
-                    dr = ALONG * u * (ONE + u * u * (THIRD + FIFTH * (u * u)))
-                    inside = ONE if dt * dt + df * df + dr * dr < square else ZERO
+                    dd, dt, df = points[j, 3] - d, points[j, 4] - t, ACROSS * (points[j, 5] - g)
+                    inside = ONE if dd * dd + dt * dt + df * df < square else ZERO
                     dx, dy, dz = points[j, 0] - px, points[j, 1] - py, points[j, 2] - pz
                     wx, wy, wz = inside * dx, inside * dy, inside * dz
                     near += inside
@@ -202,6 +199,7 @@ def estimate_normals(
     """
     normals = np.empty((3, len(chosen)), np.float32)
     scores, planarities = np.empty(len(chosen), np.float32), np.empty(len(chosen), np.float32)
-    near = covariances(x, y, z, rho, theta, phi, chosen, radius)
+    depth = logarithms(rho) * np.float32(1.0 / RANGE_SCALE)
+    near = covariances(x, y, z, depth, theta, phi, chosen, radius)
     fill_normals(*near, x[chosen], y[chosen], z[chosen], rho[chosen], *normals, scores, planarities)
     return normals, scores, planarities
