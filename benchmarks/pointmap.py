@@ -8,6 +8,7 @@ on one thread.
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import time
@@ -49,6 +50,7 @@ def ways(world: Any) -> np.ndarray:
     return np.stack([np.convolve(padded[:, axis], np.full(9, 1 / 9), "valid") for axis in (0, 1)], axis=1)
 
 
+@functools.cache
 def whole_map(seed: int) -> MapPoints:
     """Map the building from the true poses of its mapping tour."""
     from sim import World
