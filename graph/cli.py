@@ -24,6 +24,9 @@ DOMAIN = {
     "train": ("operators.kpconv.train_command", "train a segmenter on labelled sessions"),
     "evaluate": ("operators.kpconv.evaluate_command", "hold a segmenter against the truth of recorded sessions"),
     "rounds": ("operators.rounds.rounds_command", "drive, label, learn, and drive better, round after round"),
+    "evaluate-trajectory": ("operators.scans.trajectory_command", "hold a trajectory against a reference"),
+    "occupancy": ("operators.montecarlo.occupancy_command", "save the occupancy map of a recording as a ROS map"),
+    "localizers": ("operators.montecarlo.localizers_command", "drive with each localizer, with labels and without"),
     "building": ("sim.building_command", "draw and check a building"),
 }
 
