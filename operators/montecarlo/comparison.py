@@ -34,7 +34,7 @@ class Run(NamedTuple):
 
     @property
     def failed(self) -> bool:
-        """Say whether the tour did not get to its end, or the robot was lost on the recording (2 m, as in the paper)."""
+        """Say whether the tour did not get to its end, or the robot was lost on it (2 m, as in the paper)."""
         return self.ending not in ("", "tour finished") or (not self.ending and max(self.errors, default=0.0) > 2.0)
 
 
