@@ -1,0 +1,72 @@
+"""The comparison of localizers: its numbers, its report and its graphs."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import pytest
+
+from graph.check import check
+from graph.cli import main
+from operators.montecarlo.comparison import METHODS, Run, table
+from operators.montecarlo.localizers_command import add_arguments, driven_graph
+from operators.montecarlo.report import write_report
+from operators.rounds.variants import written
+
+
+def run(method="amcl", labels="none", errors=(0.2, 0.4), ending="tour finished", tour="A", name="driven") -> Run:
+    return Run(name, "hard", tour, method, labels, list(errors), ending, 7, 7, 5.0)
+
+
+RUNS = [
+    run(),
+    run(errors=(0.6,), tour="B", ending="lost"),
+    run(labels="network", errors=(0.1, 0.1)),
+    run(labels="truth", errors=(0.08, 0.08)),
+    run(method="gmapping", errors=(0.3,)),
+]
+
+
+def test_factors_are_ratios_of_mean_errors_and_failures_are_counted():
+    amcl, gmapping = table(RUNS, "driven")
+    assert amcl["labels"]["none"]["mean"] == pytest.approx(0.4)
+    assert (amcl["labels"]["none"]["failed"], amcl["labels"]["none"]["tours"]) == (1, 2)
+    assert amcl["factor_network"] == pytest.approx(4.0)
+    assert amcl["factor_truth"] == pytest.approx(5.0)
+    assert amcl["network_over_truth"] == pytest.approx(1.25)
+    assert (amcl["factor_paper"], gmapping["factor_paper"]) == (3.8, 3.0)
+    assert "factor_network" not in gmapping
+    assert run(ending="", errors=(0.1, 2.5)).failed
+    assert not run(ending="", errors=(0.1, 1.5)).failed
+
+
+def test_the_report_holds_both_tables_and_a_picture_of_each(tmp_path: Path):
+    write_report(tmp_path, [*RUNS, run(name="same", ending="")], {"seed": 1})
+    record = json.loads((tmp_path / "report.json").read_text())
+    assert set(record["tables"]) == {"driven", "same"}
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 2
+    assert "3.80" in page
+    assert "AMCL" in page
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("labels", ["none", "truth"])
+def test_each_graph_of_the_experiment_has_no_mistakes(tmp_path: Path, method: str, labels: str):
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    args = parser.parse_args(["-o", str(tmp_path)])
+    file = tmp_path / "graph.yaml"
+    file.write_text(written(driven_graph(args, "hard", "A", method, labels), "a test"))
+    report = check(file)
+    assert not report.mistakes
+    assert METHODS[method] in file.read_text()
+
+
+def test_what_is_missing_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["localizers", "-o", str(tmp_path), "--labels", "network"]) == 2
+    assert "the network's labels want its weights" in capsys.readouterr().err
+    assert main(["localizers", "-o", str(tmp_path), "--map", "nowhere.yaml"]) == 2
+    assert "nowhere.yaml: no such file" in capsys.readouterr().err
