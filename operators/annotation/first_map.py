@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from graph.geometry import transform
 from operators.annotation.alignment import Aligned, align_session
+from operators.annotation.buffer import pooled
 from operators.annotation.floor import floor_points
 from operators.annotation.session import GROUND, PERMANENT, Floats, Scan, Session
 from operators.pointmap import MapPoints, VoxelMap, find_ground
@@ -71,7 +72,7 @@ def first_map(
     for scan in aligned:
         if scan.valid:
             tracer.add(scan.points, scan.world_from_lidar)
-    movable = tracer.movable()
+    movable = pooled(tracer)
     cleaned, again = align_session(Without(aligned, pointmap.map, movable, threshold), settings=settings)
     cloud = again.map.cloud()
     found, _ = pointmap.map.nearest(cloud.points, REACH)

@@ -23,6 +23,7 @@ class GrowingBuffer:
         if known is not None:
             self.known.insert_map(known)
         self.known_rays, self.new_rays = PointRay(self.known, rays), PointRay(self.pointmap.map, rays)
+        self.known_chosen: dict[float, npt.NDArray[np.int64]] = {}  # by grain
         self.frames = 0
 
     def add(self, scan: Scan, *, known_too: bool = False) -> None:
@@ -34,13 +35,16 @@ class GrowingBuffer:
         self.frames += 1
 
     def coarse(self, grain: float) -> tuple[Floats, Floats, npt.NDArray[np.bool_]]:
-        """Return one point (k, 3) of each cube of `grain` metres, its movable probability, and whether it is new."""
-        points = np.concatenate([self.known.points, self.pointmap.map.points])
-        movable = np.concatenate([self.known_rays.movable(), self.new_rays.movable()])
-        cells = np.floor(points / grain).astype(np.int64)
-        keys = (cells[:, 0] << 42) ^ ((cells[:, 1] & 0x1FFFFF) << 21) ^ (cells[:, 2] & 0x1FFFFF)
-        _, chosen = np.unique(keys, return_index=True)
-        return points[chosen], movable[chosen], chosen >= len(self.known)
+        """Return one point (k, 3) of each cube of `grain` metres, its movable probability, and whether it is new.
+
+        Known and new points have cubes of their own: those of the known, nearly all, are chosen once.
+        """
+        if grain not in self.known_chosen:
+            self.known_chosen = {grain: one_of_each_cube(self.known.points, grain)}
+        old, fresh = self.known_chosen[grain], one_of_each_cube(self.pointmap.map.points, grain)
+        points = np.concatenate([self.known.points[old], self.pointmap.map.points[fresh]])
+        movable = np.concatenate([self.known_rays.movable()[old], self.new_rays.movable()[fresh]])
+        return points, movable, np.arange(len(points)) >= len(old)
 
     def classified(self, refinement: Refinement | None = None) -> Buffer:
         """Classify the new points.
@@ -60,3 +64,10 @@ class GrowingBuffer:
         )
         # What was known and is gone lies beside what is left: known and new are not apart.
         return classify(known_map(refined, self.classing), together, self.classing)._replace(apart=0.0)
+
+
+def one_of_each_cube(points: Floats, edge: float) -> npt.NDArray[np.int64]:
+    """Return the first point (k,) of each cube of `edge` metres among points (n, 3)."""
+    cells = np.floor(points / edge).astype(np.int64)
+    keys = (cells[:, 0] << 42) ^ ((cells[:, 1] & 0x1FFFFF) << 21) ^ (cells[:, 2] & 0x1FFFFF)
+    return np.unique(keys, return_index=True)[1]
