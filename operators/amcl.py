@@ -9,7 +9,7 @@ localizer:
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -23,7 +23,7 @@ from operators.montecarlo.map_file import OCCUPIED, GridMap, load_map
 from operators.montecarlo.scan import Scan2D
 from operators.pointmap.rehearsal import room_scan
 from operators.pointmap.trail import Trail
-from operators.scan2d import Scan2d, view
+from operators.scan2d import view
 
 SECOND = 1_000_000_000  # nanoseconds
 EMPTY = "the scan has no returns within its band of heights"
@@ -86,36 +86,12 @@ def message(stamp: int, grid: GridMap) -> OccupancyGrid:
 class Amcl(Planar):
     """Move particles with the odometry, weigh them by the scan, draw as many anew as their spread asks for."""
 
-    class Config(Scan2d.Config, forbid_unknown_fields=True):
+    class Config(Parameters):
         """The map and where to begin; the rest are the parameters of amcl by their names in ROS (metres, radians)."""
 
         map: Path = Path("recordings/maps/default.yaml")  # map.yaml: walls, doors open
         initial_pose: tuple[float, float, float] | None = None  # x, y, heading; None: where odometry begins
         global_localization: bool = False  # the robot may be anywhere
-        min_particles: int = 500
-        max_particles: int = 2000
-        kld_err: float = 0.01
-        kld_z: float = 0.99
-        odom_alpha1: float = 0.05
-        odom_alpha2: float = 0.1
-        odom_alpha3: float = 0.1
-        odom_alpha4: float = 0.05
-        laser_z_hit: float = 0.5
-        laser_z_rand: float = 0.5
-        laser_sigma_hit: float = 0.2
-        laser_likelihood_max_dist: float = 2.0
-        laser_max_beams: int = 629
-        update_min_d: float = 0.1
-        update_min_a: float = 0.2
-        resample_interval: int = 1
-        recovery_alpha_slow: float = 0.0
-        recovery_alpha_fast: float = 0.0
-        initial_cov_xx: float = 0.0025  # m^2
-        initial_cov_yy: float = 0.0025
-        initial_cov_aa: float = 0.0025  # rad^2
-        seed: int = 0
-
-    NOT_OURS: ClassVar[frozenset[str]] = frozenset({"map", "initial_pose", "global_localization"})
 
     def __init__(self, config: Config | None = None) -> None:
         """Load the map. Raises MapError, a ValueError, in one sentence for a map or settings that will not do."""
@@ -125,11 +101,8 @@ class Amcl(Planar):
 
     def begin(self, grid: GridMap) -> None:
         """Take a map."""
-        c: Amcl.Config = self.config
-        names = set(Parameters._fields) & set(c.__struct_fields__)
         self.grid = grid
-        parameters = {name: getattr(c, name) for name in Parameters._fields if name in names}
-        self.filter = Filter(grid, Parameters(**parameters, laser_max_range=c.range_max))
+        self.filter = Filter(grid, self.config)
         self.started = False
         self.particles = self.recoveries = 0
 

@@ -14,37 +14,15 @@ from operators.amcl import SECOND, Planar, message
 from operators.montecarlo.gmapping import Gmapping as Slam
 from operators.montecarlo.gmapping import Settings
 from operators.pointmap.rehearsal import room_scan
-from operators.scan2d import Scan2d
 
 
 class Gmapping(Planar):
     """Match each scan with the map of each particle, weigh the particles, and draw the scan into their maps."""
 
-    class Config(Scan2d.Config, forbid_unknown_fields=True):
-        """The parameters of gmapping by their names in ROS (metres, radians)."""
+    class Config(Settings):
+        """The parameters of gmapping by their names in ROS (metres, radians), and how often the map goes out."""
 
-        particles: int = 30
-        delta: float = 0.05
-        maxUrange: float = 30.0
-        sigma: float = 0.05
-        kernelSize: int = 1
-        lstep: float = 0.05
-        astep: float = 0.05
-        iterations: int = 5
-        lsigma: float = 0.075
-        ogain: float = 3.0
-        lskip: int = 2
-        minimumScore: float = 0.0
-        srr: float = 0.1
-        srt: float = 0.2
-        str: float = 0.1
-        stt: float = 0.2
-        linearUpdate: float = 0.1
-        angularUpdate: float = 0.05
-        resampleThreshold: float = 0.5
-        occ_thresh: float = 0.25
-        map_update_interval: float = 1.0  # seconds between two maps that go out
-        seed: int = 0
+        map_update_interval: float = 1.0  # seconds
 
     slam: Slam | None = None
     map_due = 0
@@ -57,7 +35,7 @@ class Gmapping(Planar):
 
     def build(self, start: tuple[float, float, float]) -> Slam:
         """Make particles at a pose."""
-        return Slam(Settings(**{name: getattr(self.config, name) for name in Settings._fields}), start=start)
+        return Slam(self.config, start=start)
 
     @classmethod
     def warm_up(cls) -> None:

@@ -17,7 +17,7 @@ from graph.arrays import Array, array, unit
 from graph.contract import Operator
 from graph.geometry import inverse, transform
 from graph.messages import Message, PointCloud
-from operators.montecarlo.scan import ANGLE_INCREMENT, MAX_HEIGHT, MAX_RANGE, MIN_HEIGHT, Scan2D, flatten
+from operators.montecarlo.scan import Band, Scan2D, flatten
 
 
 class LaserScan(Message, frozen=True, kw_only=True, eq=False):
@@ -33,13 +33,8 @@ class LaserScan(Message, frozen=True, kw_only=True, eq=False):
 class Scan2d(Operator):
     """Flatten each cloud."""
 
-    class Config(msgspec.Struct, forbid_unknown_fields=True):
+    class Config(Band):
         """What of a cloud is seen."""
-
-        min_height: float = MIN_HEIGHT  # metres above the floor
-        max_height: float = MAX_HEIGHT
-        angle_increment: float = ANGLE_INCREMENT  # radians
-        range_max: float = MAX_RANGE  # metres
 
     class Outputs(msgspec.Struct):
         """The scan as ranges, and as the cloud of its end points, which a localizer takes as it takes the whole."""
@@ -67,7 +62,7 @@ class Scan2d(Operator):
         return self.Outputs(laser, flat)
 
 
-def view(frame: PointCloud, config: Scan2d.Config) -> Scan2D:
+def view(frame: PointCloud, config: Band) -> Scan2D:
     """Flatten a cloud as the settings say."""
     return flatten(
         frame.points,

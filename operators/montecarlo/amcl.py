@@ -17,6 +17,7 @@ from operators.montecarlo.likelihood import free_places, likelihood_field, weigh
 from operators.montecarlo.map_file import GridMap
 from operators.montecarlo.motion import Alphas, compose, difference, move
 from operators.montecarlo.resampling import heaviest_cluster, mean_pose, resample
+from operators.montecarlo.scan import Band
 
 Doubles = npt.NDArray[np.float64]
 
@@ -30,7 +31,7 @@ MOST_RIVALS = 0.2  # share of the particles that a better pose elsewhere gets at
 SHARPNESS = 4.0  # power of the likelihood by which they become particles
 
 
-class Parameters(NamedTuple):
+class Parameters(Band):
     """The parameters of amcl, by their names in ROS; lengths in metres, angles in radians."""
 
     min_particles: int = 500
@@ -45,7 +46,6 @@ class Parameters(NamedTuple):
     laser_z_rand: float = 0.5
     laser_sigma_hit: float = 0.2
     laser_likelihood_max_dist: float = 2.0
-    laser_max_range: float = 30.0
     laser_max_beams: int = 629
     update_min_d: float = 0.1
     update_min_a: float = 0.2
@@ -82,12 +82,9 @@ class Amcl:
             raise ValueError(
                 f"amcl wants 0 < min_particles <= max_particles; given are {p.min_particles}, {p.max_particles}"
             )
-        if (
-            min(p.laser_sigma_hit, p.kld_err, p.laser_max_range) <= 0.0
-            or min(p.resample_interval, p.laser_max_beams) < 1
-        ):
+        if min(p.laser_sigma_hit, p.kld_err, p.range_max) <= 0.0 or min(p.resample_interval, p.laser_max_beams) < 1:
             raise ValueError(
-                "amcl wants laser_sigma_hit, kld_err, laser_max_range, resample_interval and laser_max_beams above 0"
+                "amcl wants laser_sigma_hit, kld_err, range_max, resample_interval and laser_max_beams above 0"
             )
         self.places = free_places(grid)
         self.cell = grid.resolution
@@ -97,7 +94,7 @@ class Amcl:
             z_rand=p.laser_z_rand,
             sigma_hit=p.laser_sigma_hit,
             max_dist=p.laser_likelihood_max_dist,
-            range_max=p.laser_max_range,
+            range_max=p.range_max,
         )
         self.alphas = Alphas(p.odom_alpha1, p.odom_alpha2, p.odom_alpha3, p.odom_alpha4)
         self.rng = np.random.default_rng(p.seed)

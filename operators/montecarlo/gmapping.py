@@ -18,11 +18,12 @@ from operators.montecarlo.matching import climb, judge
 from operators.montecarlo.motion import Spread, compose, difference, shake
 from operators.montecarlo.patches import Patches
 from operators.montecarlo.resampling import effective, systematic
+from operators.montecarlo.scan import Band
 
 Doubles = npt.NDArray[np.float64]
 
 
-class Settings(NamedTuple):
+class Settings(Band):
     """The parameters of gmapping, by their names in ROS; lengths in metres, angles in radians."""
 
     particles: int = 30

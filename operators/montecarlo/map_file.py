@@ -111,7 +111,7 @@ def _finite(value: Any) -> bool:
 
 
 def _number(path: Path, fields: dict[str, Any], key: str, default: float | None = None) -> float:
-    value = fields.get(key, default)
+    value: Any = fields.get(key, default)
     if not _finite(value):
         raise MapError(f"{path}: {key} is a number; it is {value!r}")
     return float(value)

@@ -73,8 +73,8 @@ class Patches:
             return
         count = len(store.users)
         larger = _store(count + max(missing, count // 2))
-        for old, new in zip(store[:4], larger[:4], strict=True):
-            new[:count] = old
+        larger.ends[:count], larger.visits[:count] = store.ends, store.visits
+        larger.state[:count], larger.users[:count] = store.state, store.users
         added = np.arange(len(larger.users) - 1, count - 1, -1, dtype=np.int32)
         top = int(store.top[0])
         larger.free[: len(added)] = added

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 from numba import njit
@@ -16,6 +17,15 @@ Doubles = npt.NDArray[np.float64]
 MIN_HEIGHT, MAX_HEIGHT = 0.07, 1.06  # metres above the floor
 ANGLE_INCREMENT = 0.01  # radians, of which a turn has 629
 MAX_RANGE = 30.0  # metres
+
+
+class Band(msgspec.Struct, forbid_unknown_fields=True):
+    """What of a cloud a 2-D scan sees."""
+
+    min_height: float = MIN_HEIGHT  # metres above the floor
+    max_height: float = MAX_HEIGHT
+    angle_increment: float = ANGLE_INCREMENT  # radians
+    range_max: float = MAX_RANGE  # metres
 
 
 class Scan2D(NamedTuple):
