@@ -15,16 +15,16 @@ from numba import njit
 Walkers = npt.NDArray[np.float64]  # (k, 4): x, y in metres, velocity along x and y in m/s, now
 
 BODY = 0.25  # metres from the middle of a person to its side
-STRIDE = 0.22  # metres that feet swing ahead and behind besides, at a walk
+STRIDE = 0.15  # metres that feet swing ahead and behind besides, at a walk
 WALK = 0.6  # m/s at which they do so fully
-KEPT = 0.10  # metres kept free between a person and the robot's outline circle
-EASY = 0.60  # metres from which passing a person costs nothing
+KEPT = 0.05  # metres kept free between a person and the robot's outline circle
+EASY = 0.50  # metres from which passing a person costs nothing
 BELIEVED = 2.0  # seconds for which a velocity says where somebody will be
-CERTAIN = 1.2  # seconds within which nobody is driven into, by what is known now
-PERSON_COST = 6.0  # seconds for each second's way at full speed with no room at all
+CERTAIN = 1.0  # seconds within which nobody is driven into, by what is known now
+PERSON_COST = 3.0  # seconds for each second's way at full speed with no room at all
 NEAR = 0.25  # metres: nearer, even a robot that stands is better elsewhere
-NEAR_COST = 4.0  # seconds a second with no room at all
-GENTLE, SPEED_PER_METRE = 0.25, 2.0  # m/s with no room, and m/s more for each metre of it
+NEAR_COST = 3.0  # seconds a second with no room at all
+GENTLE, SPEED_PER_METRE = 0.25, 2.5  # m/s with no room, and m/s more for each metre of it
 HURRY_COST = 4.0  # seconds a second, at twice the speed that the room allows
 
 NOBODY: Walkers = np.zeros((0, 4))
@@ -44,7 +44,7 @@ def person_room(walkers: Walkers, seconds: float, x: float, y: float) -> tuple[f
         for share in range(2):
             ahead = walkers[index, 0] + share * seconds * walkers[index, 2] - x
             aside = walkers[index, 1] + share * seconds * walkers[index, 3] - y
-            foot = min(half, max(-half, -(ahead * forward + aside * left)))
+            foot = share * min(half, max(-half, -(ahead * forward + aside * left)))  # who stands has feet together
             ahead, aside = ahead + foot * forward, aside + foot * left
             away = math.sqrt(ahead * ahead + aside * aside)
             if away - BODY < least:
