@@ -24,7 +24,7 @@ def test_a_row_shows_its_peer_and_ratio() -> None:
 def test_every_benchmark_is_found_and_unknown_ones_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert {"transport", "chain"} <= set(bench.modules())
     assert bench.main(["transprt"]) == 2
-    assert "there is no benchmark 'transprt'; there are chain," in capsys.readouterr().err
+    assert "there is no benchmark 'transprt'; there are annotation," in capsys.readouterr().err
 
 
 def test_a_module_that_cannot_run_says_why_and_the_rest_goes_on(
