@@ -128,7 +128,7 @@ def with_pointray(record: Drive) -> Found:
 
 
 def with_dufomap(record: Drive) -> Found:
-    """Run dufomap with its authors' settings for indoor maps, on one thread."""
+    """Run dufomap as its authors' example does: 0.1 m voxels, d_s 0.2 m, d_p 2; on one thread."""
     from dufomap import dufomap
 
     poses = [pose @ record.base_from_lidar for pose in record.world_from_base]
