@@ -23,6 +23,7 @@ MASS, WHEEL_MASS = 14.0, 0.8  # kg
 MOTOR = 6.0  # N m, the most a wheel's motor gives
 TOP_SPEED, TOP_TURN = 1.3, 1.0  # m/s, rad/s
 ACCELERATION, TURN_ACCELERATION = 1.0, 2.5  # m/s^2, rad/s^2
+FASTEST, FASTEST_TURN = 1.5, 1.5  # m/s, rad/s: what pushing and being pushed can do to the robot
 MAST = 0.06, 0.68  # metres: width and top of the column that carries the lidar
 PERSON_REACH = 1.6  # metres from the robot within which people have bodies
 GLIDE = 6  # substeps between two placements of walking people
@@ -134,6 +135,20 @@ class Physics:
             self.target[index] += min(max(gap, -limit), limit)
         self._motors()
         p.stepSimulation(physicsClientId=self.client)
+        self._hold()
+
+    def _hold(self) -> None:
+        """Take the speed that no robot on wheels has: Bullet parts bodies that overlap by throwing the lighter one."""
+        velocity, spin = p.getBaseVelocity(self.robot, physicsClientId=self.client)
+        fast, turning = math.hypot(velocity[0], velocity[1]), abs(spin[2])
+        if fast > FASTEST or turning > FASTEST_TURN:
+            slower, calmer = min(1.0, FASTEST / max(fast, 1e-9)), min(1.0, FASTEST_TURN / max(turning, 1e-9))
+            p.resetBaseVelocity(
+                self.robot,
+                [slower * velocity[0], slower * velocity[1], velocity[2]],
+                [spin[0], spin[1], calmer * spin[2]],
+                physicsClientId=self.client,
+            )
 
     def _motors(self) -> None:
         linear, angular = getattr(self, "target", [0.0, 0.0])

@@ -18,7 +18,7 @@ from graph.geometry import wrap, yaw
 from sim import World
 from sim.building import Block, Tour
 from sim.odometry import OdometryNoise
-from sim.physics import ACCELERATION, TOP_SPEED, TOP_TURN
+from sim.physics import ACCELERATION, FASTEST, TOP_SPEED, TOP_TURN
 from sim.scenario import Scenario
 from sim.solids import Truth
 from tests.small_rooms import NOBODY, box_room, two_rooms
@@ -122,7 +122,9 @@ def test_people_stop_the_robot_and_count() -> None:
     world = World(building, crowd, "A", 1)
     assert len(world.crowd.position) == 3
     for _ in range(150):
+        before = world.motion.world_from_base[:2, 3]
         world.advance(0.6, 0.0)
+        assert np.hypot(*(world.motion.world_from_base[:2, 3] - before)) < 0.1 * FASTEST + 0.01  # and nobody throws it
     assert world.collisions["people"] >= 1
     assert world.collisions["people"] < 60
     base = world.motion.world_from_base
