@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import functools
 import json
+import multiprocessing
+import sys
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +29,7 @@ from operators.montecarlo import Amcl, Gmapping, GridMap, Parameters, Settings, 
 RECORDING, MAP = Path("build/montecarlo.mcap"), Path("recordings/maps/default.yaml")
 PARTICLES = 2000
 WARM_UP = 5  # updates
+PATIENCE = 300.0  # seconds that the peer may take
 PEER = "PyPI amcl (Nav2's)"
 
 
@@ -132,10 +135,12 @@ def rows() -> list[dict[str, Any]]:
     """Measure; without PyPI's amcl its columns stay empty."""
     grid, known = load_map(MAP), drive()
     mine = ours(grid, known)
-    try:
-        other: Result | None = peer(grid, known)
-    except ImportError:
-        other = None
+    other: Result | None = None
+    with multiprocessing.get_context("spawn").Pool(1) as pool:  # a process can be stopped, a call of C++ cannot
+        try:
+            other = pool.apply_async(peer, (grid, known)).get(PATIENCE)
+        except (ImportError, multiprocessing.TimeoutError) as error:
+            print(f"{PEER} gave nothing: {type(error).__name__} {error}", file=sys.stderr)
     found = [
         _row(
             "amcl, 2000 particles, all bins, an update",
