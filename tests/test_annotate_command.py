@@ -111,6 +111,7 @@ def test_an_interrupted_run_goes_on_where_it_was(building, annotated, tmp_path):
     assert (annotated[1] / "monday.labelled.mcap").stat().st_mtime_ns == kept
 
 
+@pytest.mark.slow
 def test_every_third_frame_is_labelled_alike(building, annotated):
     told = annotate(building, ["monday.mcap", "--map", "map.ply", "-o", "out3", "--every", "3"])
     alone = annotate(building, ["monday.mcap", "--map", "map.ply", "-o", "out1"])
@@ -132,6 +133,7 @@ def test_workers_change_no_bit(building, annotated):
         np.testing.assert_array_equal(one.label, two.label)
 
 
+@pytest.mark.slow
 def test_a_session_without_poses_is_aligned_by_its_odometry(building):
     record(building / "bare.mcap", chair=True, walks=True, poses=False, seed=5)
     told = annotate(building, ["bare.mcap", "--map", "map.ply", "-o", "out_bare"])
@@ -174,6 +176,7 @@ def test_sessions_that_will_not_do_are_refused_with_the_reason(building, capsys,
     assert reason in refusal(building, capsys, name, **config)
 
 
+@pytest.mark.slow
 def test_a_refused_session_leaves_the_others_alone(building, annotated, capsys):
     record(building / "astray.mcap", shift=1.4, seed=4)
     told = annotate(building, ["monday.mcap", "astray.mcap", "tuesday.mcap", "--map", "map.ply", "-o", "out4"])

@@ -119,6 +119,7 @@ def test_settings_that_cannot_be_are_named():
         Annotator(Annotator.Config(every=0))
 
 
+@pytest.mark.slow
 def test_known_points_that_a_session_saw_through_lose_their_place(tmp_path):
     cupboard = (np.array([0.2, 2.0, 0.0]), np.array([0.9, 2.6, 1.6]))
     pointmap = PointMap()
