@@ -46,6 +46,16 @@ class PointCloud(Message, frozen=True, kw_only=True, eq=False):
     instance: Annotated[Array, array("int32", "n", about="body number, unique within the session")] | None = None
 
 
+class LaserScan(Message, frozen=True, kw_only=True, eq=False):
+    """Ranges at even bearings, the fields of ROS's message of this name; bearing 0 is the base's x axis."""
+
+    ranges: Annotated[Array, array("float32", "n", unit="m", about="inf where nothing was met")]
+    angle_min: Annotated[float, unit("rad", about="bearing of the first range")]
+    angle_increment: Annotated[float, unit("rad")]
+    range_max: Annotated[float, unit("m")]
+    sensor: Annotated[Array, array("float64", 2, unit="m", frame="base", about="where beams begin")]
+
+
 class Odometry(Message, frozen=True, kw_only=True, eq=False):
     """Where wheels and gyro say the robot is; a simulator adds the truth."""
 
@@ -104,6 +114,15 @@ class Plan(Message, frozen=True, kw_only=True, eq=False):
     path: Annotated[Array, array("float64", "n", 2, unit="m", frame="world")]
     trajectory: Annotated[Array, array("float64", "k", 3, unit="m, rad", frame="world", about="x, y, yaw")]
     status: str = "follow"  # follow, recover, unreachable, arrived, wait
+
+
+class Tracks(Message, frozen=True, kw_only=True, eq=False):
+    """People that are followed, in the order in which they were met."""
+
+    identity: Annotated[Array, array("int32", "k", about="from 1, never given twice")]
+    position: Annotated[Array, array("float64", "k", 2, unit="m", frame="world")]
+    velocity: Annotated[Array, array("float64", "k", 2, unit="m/s", frame="world")]
+    unseen: Annotated[Array, array("float32", "k", unit="s", about="since the last sighting")]
 
 
 class Truth(Message, frozen=True, kw_only=True, eq=False):

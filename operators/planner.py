@@ -17,13 +17,12 @@ import numpy as np
 
 from graph.contract import Operator
 from graph.geometry import Matrix, interpolate, planar
-from graph.messages import Drive, Goal, OccupancyGrid, Plan, PointCloud, Pose
+from graph.messages import Drive, Goal, OccupancyGrid, Plan, PointCloud, Pose, Tracks
 from operators.navigation.footprint import Footprint
 from operators.navigation.navigator import Navigator
 from operators.navigation.people import NOBODY, Walkers
 from operators.navigation.window import Limits
 from operators.pointmap.rehearsal import room_scan
-from operators.tracker import Tracks
 
 HISTORY = 50  # poses kept, to find where a frame was taken
 WAITING = 10  # frames kept until the pose of their time is known

@@ -8,26 +8,14 @@ scan2d:
 from __future__ import annotations
 
 import math
-from typing import Annotated
 
 import msgspec
 import numpy as np
 
-from graph.arrays import Array, array, unit
 from graph.contract import Operator
 from graph.geometry import inverse, transform
-from graph.messages import Message, PointCloud
+from graph.messages import LaserScan, PointCloud
 from operators.montecarlo.scan import Band, Scan2D, flatten
-
-
-class LaserScan(Message, frozen=True, kw_only=True, eq=False):
-    """Ranges at even bearings, the fields of ROS's message of this name; bearing 0 is the base's x axis."""
-
-    ranges: Annotated[Array, array("float32", "n", unit="m", about="inf where nothing was met")]
-    angle_min: Annotated[float, unit("rad", about="bearing of the first range")]
-    angle_increment: Annotated[float, unit("rad")]
-    range_max: Annotated[float, unit("m")]
-    sensor: Annotated[Array, array("float64", 2, unit="m", frame="base", about="where beams begin")]
 
 
 class Scan2d(Operator):

@@ -106,7 +106,8 @@ class TrueSegmenter(Counted):
         """Subsample a frame and name its classes. Raises ValueError for a frame without truth."""
         if frame.truth is None:
             raise ValueError("TrueSegmenter wants frames with truth, which only a simulator gives")
-        chosen = np.sort(central_points(*np.ascontiguousarray(frame.points.T), self.config.voxel))
+        x, y, z = np.ascontiguousarray(frame.points.T)
+        chosen = np.sort(central_points(x, y, z, self.config.voxel))
         labels = LABEL_OF_TRUTH[frame.truth]
         scores = certain(labels)
         whole = msgspec.structs.replace(frame, label=labels, scores=scores)

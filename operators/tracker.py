@@ -8,15 +8,13 @@ tracker:
 from __future__ import annotations
 
 from collections import deque
-from typing import Annotated
 
 import msgspec
 import numpy as np
 
-from graph.arrays import Array, array
 from graph.contract import Operator, Summary
 from graph.geometry import planar, transform
-from graph.messages import Message, PointCloud, Pose
+from graph.messages import PointCloud, Pose, Tracks
 from operators.pointmap.rehearsal import room_scan
 from operators.tracking.tracker import Habits
 from operators.tracking.tracker import Tracker as Tracking
@@ -24,15 +22,6 @@ from operators.tracking.tracker import Tracker as Tracking
 SECOND = 1_000_000_000  # nanoseconds
 WAITING = 10  # frames kept until their pose is known
 LOWEST, HIGHEST = 0.1, 2.1  # metres above the floor between which people are
-
-
-class Tracks(Message, frozen=True, kw_only=True, eq=False):
-    """People that are followed, in the order in which they were met."""
-
-    identity: Annotated[Array, array("int32", "k", about="from 1, never given twice")]
-    position: Annotated[Array, array("float64", "k", 2, unit="m", frame="world")]
-    velocity: Annotated[Array, array("float64", "k", 2, unit="m/s", frame="world")]
-    unseen: Annotated[Array, array("float32", "k", unit="s", about="since the last sighting")]
 
 
 class Tracker(Operator):
