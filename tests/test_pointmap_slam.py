@@ -230,3 +230,19 @@ def test_a_level_robot_gives_up_height_and_tilt_but_no_place():
     assert math.acos(half[2, 2]) == pytest.approx(0.5 * math.acos(pose[2, 2]), rel=1e-3)
     assert np.allclose(leveled(pose, 1.0), planar(1.0, -2.0, yaw(pose)))
     assert np.allclose(leveled(pose, 0.0), pose)
+
+
+@pytest.mark.parametrize("slip", [0.06, 0.13, 0.2])
+def test_wheels_that_slip_neither_move_the_robot_nor_spoil_the_map(slip):
+    pose = planar(1.5, -1.5, 0.3) @ BASE_FROM_LIDAR
+    pointmap = PointMap()
+    for place in (planar(4.5, -1.5, 0.0), planar(3.0, 1.5, 0.5), planar(1.5, -1.5, 0.3)):
+        pointmap.enter(pointmap.prepare(scan(place @ BASE_FROM_LIDAR)), place @ BASE_FROM_LIDAR)
+    for number in range(3):
+        before = len(pointmap.map)
+        track = pointmap.track(scan(pose, noise=0.008, seed=number), pose @ planar(slip, 0.0, 0.0))
+        assert track.valid
+        assert error_of(track.world_from_lidar, pose)[0] < 0.005
+        assert track.added == 0
+        assert len(pointmap.map) == before
+    assert pointmap.track(scan(pose), pose @ planar(0.01, 0.0, 0.0)).added > 0
