@@ -4,7 +4,7 @@ BIN := .venv/bin
 EXTRAS := $(shell $(PYTHON) -c "import sys; print('sim,view,ros,evo,dev,bench' if sys.version_info < (3, 12) else 'view,ros,evo,dev,bench')")
 RECORD ?=
 
-.PHONY: setup launch test test-all bench lint clean
+.PHONY: setup launch test test-all bench lint clean fresh
 
 setup: .venv/installed
 
@@ -26,6 +26,9 @@ test-all: setup
 
 bench: setup
 	$(BIN)/python -m benchmarks
+
+fresh: # numba does not see that a kernel of another file has changed
+	find graph operators sim tests benchmarks -name __pycache__ -prune -exec rm -r {} +
 
 lint: setup
 	$(BIN)/ruff check .
