@@ -15,7 +15,6 @@ from collections import deque
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 SIZE = 16 << 20  # bytes of payloads; pages are only taken when first written
 LARGE = 1 << 15  # bytes of a payload that goes through it; smaller ones fit a packet
@@ -49,12 +48,8 @@ class _Memory:
     def __init__(self, descriptor: int, readers: int) -> None:
         self.start = _LINE * (1 + readers)
         self.bytes = mmap.mmap(descriptor, self.start + SIZE)
-        words = np.frombuffer(self.bytes, np.uint64, self.start // 8)
-        self.counters: npt.NDArray[np.uint64] = words[:: _LINE // 8]  # written up to; then released up to, by reader
-
-    def piece(self, position: int, length: int) -> npt.NDArray[np.uint8]:
-        """Return the (length,) bytes at a position."""
-        return np.frombuffer(self.bytes, np.uint8, length, self.start + position % SIZE)
+        # one a line: written up to; then released up to, by reader
+        self.counters = memoryview(self.bytes)[: self.start].cast("Q")[:: _LINE // 8]
 
 
 class RingWriter(_Memory):
@@ -62,8 +57,8 @@ class RingWriter(_Memory):
 
     def allocate(self, length: int) -> tuple[int, memoryview] | None:
         """Return position and memory of a new payload of `length` bytes; None while readers hold too much."""
-        head = int(self.counters[0])
-        released = min(int(self.counters[1:].min()), head)
+        head, *released_by = self.counters
+        released = min(head, *released_by)
         if released == head:
             position = released = -(-head // SIZE) * SIZE  # all is read: begin again where the caches are warm
         else:
@@ -71,7 +66,8 @@ class RingWriter(_Memory):
         if position + length - released > SIZE:
             return None
         self.counters[0] = _end(position, length)
-        return position, self.piece(position, length).data
+        begin = self.start + position % SIZE
+        return position, memoryview(self.bytes)[begin : begin + length]
 
 
 class RingReader(_Memory):
@@ -91,7 +87,8 @@ class RingReader(_Memory):
 
         With `copy` a copy, so that the place is free at once.
         """
-        piece, end = self.piece(position, length), _end(position, length)
+        piece = np.frombuffer(self.bytes, np.uint8, length, self.start + position % SIZE)
+        end = _end(position, length)
         if self.copy:
             copied = piece.tobytes()
             self.counter[0] = end
