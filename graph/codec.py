@@ -113,22 +113,23 @@ def _unpack_array(code: int, data: memoryview) -> Array:
     return aligned_copy(data[split:], dtype, shape)
 
 
-Check = Callable[[Any, dict[str, int], str], None]
+Check = Callable[[Any, dict[str, int], str, str], None]  # value, lengths by name, what it is part of, its name
 
 
 def _array_check(spec: ArraySpec) -> Check:
-    dtype = np.dtype(spec.dtype)
+    dtype, sizes = np.dtype(spec.dtype), tuple(spec.shape)
 
-    def check(value: Any, lengths: dict[str, int], where: str) -> None:
-        good = isinstance(value, np.ndarray) and value.dtype == dtype and value.ndim == len(spec.shape)
-        if good:
-            for wanted, length in zip(spec.shape, value.shape, strict=True):
+    def check(value: Any, lengths: dict[str, int], where: str, name: str) -> None:
+        good = isinstance(value, np.ndarray) and value.dtype == dtype
+        if good and (shape := value.shape) != sizes:
+            good = len(shape) == len(sizes)
+            for wanted, length in zip(sizes, shape, strict=False):
                 good = good and length == (wanted if isinstance(wanted, int) else lengths.setdefault(wanted, length))
         if not good:
             given = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
-            known = {name: length for name, length in lengths.items() if name in spec.shape}
+            known = {side: length for side, length in lengths.items() if side in spec.shape}
             hint = f" with {', '.join(f'{k} = {v}' for k, v in known.items())}" if known else ""
-            raise CodecError(f"{where} wants {spec}{hint}; it was given {given}")
+            raise CodecError(f"{where}.{name} wants {spec}{hint}; it was given {given}")
 
     return check
 
@@ -143,26 +144,31 @@ def _check_for(hint: Any) -> Check | None:
                 return _array_check(spec)
         return _check_for(inner)
     if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
-        return _check_struct if struct_checks(hint) else None
+        return _check_part if struct_checks(hint) else None
     checks = [check for arg in typing.get_args(hint) if (check := _check_for(arg)) is not None]
     if not checks:
         return None
     only = checks[0]
 
-    def check_all(value: Any, lengths: dict[str, int], where: str) -> None:
-        if origin in (list, tuple, dict):
-            for item in value.values() if origin is dict else value:
-                only(item, {}, f"{where}[]")
-        elif value is not None:  # a union: None, or the one kind of array or struct it may hold
-            only(value, lengths, where)
+    def check_all(value: Any, lengths: dict[str, int], where: str, name: str) -> None:
+        for item in value.values() if origin is dict else value:
+            only(item, {}, where, f"{name}[]")
 
-    return check_all
+    def check_some(value: Any, lengths: dict[str, int], where: str, name: str) -> None:
+        if value is not None:  # a union: None, or the one kind of array or struct it may hold
+            only(value, lengths, where, name)
+
+    return check_all if origin in (list, tuple, dict) else check_some
 
 
-def _check_struct(value: Any, lengths: dict[str, int], where: str) -> None:
+def _check_part(value: Any, lengths: dict[str, int], where: str, name: str) -> None:
+    _check_struct(value, f"{where}.{name}")
+
+
+def _check_struct(value: Any, where: str) -> None:
     own: dict[str, int] = {}
     for name, check in struct_checks(type(value)):
-        check(getattr(value, name), own, f"{where}.{name}")
+        check(getattr(value, name), own, where, name)
 
 
 _struct_checks: dict[type[Any], tuple[tuple[str, Check], ...]] = {}
@@ -170,8 +176,8 @@ _struct_checks: dict[type[Any], tuple[tuple[str, Check], ...]] = {}
 
 def struct_checks(kind: type[Any]) -> tuple[tuple[str, Check], ...]:
     """List (field, check) of the fields of a struct that hold arrays."""
-    if kind in _struct_checks:
-        return _struct_checks[kind]
+    if (known := _struct_checks.get(kind)) is not None:
+        return known
     hints = typing.get_type_hints(kind, include_extras=True)
     found = ((name, _check_for(hints[name])) for name in kind.__struct_fields__)
     _struct_checks[kind] = tuple((name, check) for name, check in found if check is not None)
@@ -188,7 +194,7 @@ def encode(message: msgspec.Struct) -> bytes:
 def encode_into(message: msgspec.Struct, room: Room | None) -> bytes | memoryview:
     """Encode a message into the memory that `room` has for it, or else into new bytes. Raises as `encode`."""
     try:
-        _check_struct(message, {}, type(message).__name__)
+        _check_struct(message, type(message).__name__)
     except (TypeError, AttributeError) as error:
         raise CodecError(f"{type(message).__name__}: {error}") from error
     try:
@@ -211,7 +217,7 @@ def decode(payload: bytes | memoryview, kind: type[msgspec.Struct]) -> Any:
         message = _decoder(kind).decode(payload)
     except (msgspec.MsgspecError, ValueError, TypeError, IndexError) as error:
         raise CodecError(f"not a {kind.__name__}: {error}") from error
-    _check_struct(message, {}, kind.__name__)
+    _check_struct(message, kind.__name__)
     return message
 
 
