@@ -10,8 +10,10 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
-SECOND = 1_000_000_000
-DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}  # sensor_msgs/PointField
+from operators.scans.bag import DTYPES
+from operators.scans.stamps import SECOND
+
+DATATYPES = {name: number for number, name in DTYPES.items()}
 COORDINATES = {"points": ("x", "y", "z"), "normals": ("normal_x", "normal_y", "normal_z")}
 SCORES = ("p_ground", "p_permanent", "p_longT", "p_shortT")
 
