@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 
 from graph.codec import decode, digest, encode_into
 from graph.contract import End, Operator, Source, Summary, ports_of
+from graph.errors import UserError
 from graph.ledger import Emitted, Ref, Skip, Step
 from graph.loading import build_config, load_class
 from graph.lockstep import Arrival
@@ -46,10 +48,15 @@ def _plain(value: Any) -> Any:
 
 
 def build_operator(spec: NodeSpec) -> Operator:
-    """Import, warm up and construct the operator of a spec. Raises UserError by name."""
+    """Import, warm up and construct the operator of a spec. Raises UserError by name, also for a bad config."""
     kind = load_class(spec.run, spec.root)
     kind.warm_up()
-    return kind(build_config(kind, spec.config, Path(spec.root)))
+    config = build_config(kind, spec.config, Path(spec.root))
+    try:
+        return kind(config)
+    except (ValueError, OSError) as error:  # a file, a scenario, a number that cannot be
+        logging.getLogger(spec.name).debug("cannot be made", exc_info=True)
+        raise UserError(f"{spec.name}: {error}") from error
 
 
 class Node:

@@ -9,10 +9,14 @@ import numpy as np
 import pytest
 
 from graph import End, Summary
+from graph.check import require
 from graph.codec import decode, encode
 from graph.contract import ports_of
+from graph.errors import UserError
 from graph.loading import build_config
 from graph.messages import Drive, Goal, Odometry, PointCloud, Pose, Tick, Truth
+from graph.node import build_operator
+from graph.wiring import wire
 from operators.simulator import Simulator
 
 STEP = 100_000_000  # nanoseconds
@@ -195,3 +199,9 @@ def test_two_simulators_of_one_config_agree_to_the_bit(files: tuple[Path, str]) 
 def test_bad_settings_are_named(config: dict[str, object], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         Simulator(Simulator.Config(**config))  # type: ignore[arg-type]
+
+
+def test_a_scenario_that_is_not_there_is_one_sentence_in_a_graph() -> None:
+    spec = next(spec for spec in wire(require("graph.yaml", ("simulator.scenario=hrad",))) if spec.name == "simulator")
+    with pytest.raises(UserError, match=r"^simulator: .*hrad"):
+        build_operator(spec)
