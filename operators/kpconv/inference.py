@@ -1,7 +1,7 @@
 """The fast path of a trained KPFCNN: folded batch norms, no autograd, bfloat16 where the CPU has it, lasting buffers.
 
 Tolerance against the training path in evaluation mode: class probabilities within 1e-4 in float32 and within 0.1 in
-bfloat16, mean difference below 0.005 (tests/test_kpconv_inference.py).
+bfloat16, mean difference below 0.005 (tests/test_kpconv_network.py).
 """
 
 from __future__ import annotations
@@ -46,6 +46,16 @@ def best_precision() -> torch.dtype:
     return torch.bfloat16 if native else torch.float32
 
 
+def whole(rows: int) -> int:
+    """Round up to eighths of a power of two, at least 64.
+
+    Torch's bfloat16 products are compiled anew for each size that they have not met, which takes longer than the
+    product itself; and no two frames have equally many points.
+    """
+    step = max(8, (1 << max(0, rows - 1).bit_length()) // 16)
+    return max(64, -(-rows // step) * step)
+
+
 class FastKPFCNN:
     """A trained network made for inference on the CPU, one frame at a time."""
 
@@ -83,12 +93,13 @@ class FastKPFCNN:
         )
 
     def room(self, name: str, rows: int, columns: int) -> Tensor:
-        """Return a buffer of this shape that stays until its name is asked for again."""
+        """Return a buffer (whole(rows), columns) that stays until its name is asked for again."""
+        size = whole(rows) * columns
         buffer = self.buffers.get(name)
-        if buffer is None or buffer.numel() < rows * columns:
-            buffer = torch.empty(rows * columns * 5 // 4, dtype=self.precision)
+        if buffer is None or buffer.numel() < size:
+            buffer = torch.zeros(size * 5 // 4, dtype=self.precision)
             self.buffers[name] = buffer
-        return buffer[: rows * columns].view(rows, columns)
+        return buffer[:size].view(-1, columns)
 
     def apply(self, name: str, layer: Affine, features: Tensor) -> Tensor:
         """Multiply, add, rectify: (m, inputs) to (m, outputs)."""
@@ -102,9 +113,9 @@ class FastKPFCNN:
         out = self.room("aggregate", count, points * channels)
         parts = (links.starts, links.columns, links.places, links.weights)
         if self.precision == torch.float32:
-            split(gather, count, *parts, features.numpy(), out.numpy().reshape(count, points, channels))
+            split(gather, count, *parts, features.numpy(), out.numpy().reshape(-1, points, channels))
         else:
-            split(gather_halves, count, *parts, bits(features), bits(out).reshape(count, points, channels))
+            split(gather_halves, count, *parts, bits(features), bits(out).reshape(-1, points, channels))
         return out
 
     def largest(self, name: str, features: Tensor, links: Links) -> Tensor:
@@ -113,7 +124,7 @@ class FastKPFCNN:
         out = self.room(name, count, channels)
         parts = (links.neighbour_starts, links.neighbours)
         if self.precision == torch.float32:
-            winners = np.empty((count, channels), np.int32)
+            winners = np.empty((len(out), channels), np.int32)
             split(gather_largest, count, *parts, features.numpy(), out.numpy(), winners)
         else:
             signed = (bits(features).view(np.int16), bits(out).view(np.int16))
@@ -153,11 +164,12 @@ class FastKPFCNN:
             coarse = self.room("coarse", len(features), decoder.weight.shape[1])
             torch.addmm(decoder.bias, features, decoder.weight[:above], out=coarse)
             features = self.room(f"decoder {level}", len(skip), decoder.weight.shape[1])
-            torch.index_select(coarse, 0, torch.from_numpy(pyramid.parents[level]), out=features)
+            parents = torch.from_numpy(pyramid.parents[level])
+            torch.index_select(coarse, 0, parents, out=features[: len(parents)])
             features.addmm_(skip, decoder.weight[above:])
             nn.functional.leaky_relu_(features, SLOPE)
         logits = self.apply("last", self.last, self.apply("hidden", self.hidden, features))
-        return softmax(logits.float().numpy())
+        return softmax(logits[: len(inputs)].float().numpy())
 
 
 def softmax(logits: Floats) -> Floats:
