@@ -2,7 +2,8 @@
 
 simulator:
   run: operators.simulator:Simulator
-  inputs: {tick: timer/10hz, drive: {from: planner/drive, delay: 100ms}, pose: {from: localizer/pose, delay: 100ms}}
+  inputs: {tick: timer/10hz, drive: {from: planner/drive, delay: 100ms}, pose: {from: localizer/pose, delay: 100ms},
+    plan: {from: planner/plan, delay: 100ms}}
   config: {building: sim/buildings/default.yaml, scenario: easy, tour: A, seed: 1}
 
 The robot is put at the start pose of its tour and knows it: odometry begins at world_from_base of the first tick, so
@@ -19,7 +20,7 @@ import numpy as np
 
 from graph.contract import End, Operator, Summary
 from graph.geometry import Matrix
-from graph.messages import Drive, Goal, Odometry, PointCloud, Pose, Tick, Truth
+from graph.messages import Drive, Goal, Odometry, Plan, PointCloud, Pose, Tick, Truth
 from sim.lidar import LidarSpec
 from sim.odometry import OdometryNoise
 from sim.referee import Referee
@@ -70,6 +71,7 @@ class Simulator(Operator):
         )
         self.referee = Referee(self.world.targets, self.world.length, patience=c.patience, radius=c.goal_radius)
         self.command = (0.0, 0.0)
+        self.asked = (0, 0)  # index of the target asked for, and since which stamp
         self.now: int | None = None  # stamp of the last tick
         self.poses: dict[int, Matrix] = {}  # true world_from_base by stamp, for estimates still to come
 
@@ -86,6 +88,12 @@ class Simulator(Operator):
         true = self.poses.get(pose.measured_at)
         if true is not None:
             self.referee.judge(pose.world_from_base, true)
+
+    def on_plan(self, plan: Plan | None) -> None:
+        """Go on with the next target once the planner, knowing of the present one, calls it unreachable."""
+        assert plan is not None
+        if plan.status == "unreachable" and plan.measured_at >= self.asked[1]:
+            self.referee.skip()
 
     def on_tick(self, tick: Tick) -> Iterator[Outputs | End]:
         """Advance to the tick, scan, and say whether the tour goes on. Raises ValueError at a tick of another rate."""
@@ -139,6 +147,8 @@ class Simulator(Operator):
         """Name the target to reach next, after the tour the last one."""
         targets = self.world.targets
         index = min(self.referee.index, len(targets) - 1)
+        if index != self.asked[0]:
+            self.asked = (index, now)
         return Goal(measured_at=now, target=targets[index], index=index, count=len(targets))
 
     def on_end(self) -> Summary:

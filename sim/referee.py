@@ -1,7 +1,8 @@
 """The referee of a tour: targets reached, the error of the robot's belief, and when the robot is stuck or lost.
 
 The rules are the paper's: a target counts when the robot believes to be within 0.9 m of it, and is within 1.5 m; a tour
-is over when the mean speed over 15 s falls below 0.03 m/s, or when the error exceeds 2 m.
+is over when the mean speed over 15 s falls below 0.03 m/s, or when the error exceeds 2 m. A target that the robot calls
+unreachable is skipped, and counts as not reached.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ class Referee:
         self.limit = patience * length / FREE_SPEED
         self.radius = radius
         self.index = 0  # of the next target
+        self.skipped = 0  # targets that the robot gave up
         self.errors: list[float] = []
         self.believed: Array | None = None  # (2,) where the robot last said it was
         self.track: deque[tuple[float, float]] = deque()  # time, and metres driven until then, of the last SLOW_TIME
@@ -49,6 +51,12 @@ class Referee:
         """Take the robot's estimate of a pose, and the true one of the same moment; both world_from_base (4, 4)."""
         self.believed = np.array(believed[:2, 3])
         self.errors.append(float(np.hypot(*(believed[:2, 3] - true[:2, 3]))))
+
+    def skip(self) -> None:
+        """Go on with the next target: the robot calls this one unreachable."""
+        if self.index < len(self.targets):
+            self.index += 1
+            self.skipped += 1
 
     def watch(self, time: float, true: Array) -> str:
         """Look at the robot's true pose at a time in seconds; return why the tour is over, or nothing.
@@ -83,11 +91,12 @@ class Referee:
         return ""
 
     def summary(self) -> dict[str, Any]:
-        """Return targets, reached, the error's quantiles, metres driven, seconds and the ending, all as numbers."""
+        """Return targets, reached, skipped, the error's quantiles, metres, seconds and ending, all as numbers."""
         errors = np.array(self.errors) if self.errors else np.zeros(1)
         return {
             "targets": len(self.targets),
-            "reached": self.index,
+            "reached": self.index - self.skipped,
+            "skipped": self.skipped,
             "localization_error_m": {
                 "median": float(np.median(errors)),
                 "p95": float(np.percentile(errors, 95)),

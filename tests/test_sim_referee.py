@@ -93,3 +93,14 @@ def test_errors_are_judged_in_the_plane() -> None:
     assert errors["median"] == pytest.approx(0.2)
     assert errors["max"] == pytest.approx(0.9)
     assert 0.2 < errors["p95"] < 0.9
+
+
+def test_a_skipped_target_is_not_reached_and_the_tour_goes_on() -> None:
+    referee = Referee(TARGETS, 4.0)
+    referee.skip()
+    assert drive(referee, list(np.arange(0.0, 5.0, 0.1))) == FINISHED
+    summary = referee.summary()
+    assert (summary["targets"], summary["reached"], summary["skipped"]) == (2, 1, 1)
+    assert summary["driven_m"] == pytest.approx(3.2, abs=0.11)  # the second target was still driven to
+    referee.skip()
+    assert referee.summary()["skipped"] == 1  # no target is left

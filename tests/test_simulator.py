@@ -14,7 +14,7 @@ from graph.codec import decode, encode
 from graph.contract import ports_of
 from graph.errors import UserError
 from graph.loading import build_config
-from graph.messages import Drive, Goal, Odometry, PointCloud, Pose, Tick, Truth
+from graph.messages import Drive, Goal, Odometry, Plan, PointCloud, Pose, Tick, Truth
 from graph.node import build_operator
 from graph.wiring import wire
 from operators.simulator import Simulator
@@ -59,8 +59,31 @@ def tick(simulator: Simulator, index: int) -> tuple[Simulator.Outputs, str]:
 
 def test_ports_and_their_order() -> None:
     ports = ports_of(Simulator)
-    assert list(ports.inputs) == ["drive", "pose", "tick"]
+    assert list(ports.inputs) == ["drive", "pose", "plan", "tick"]
     assert ports.outputs == {"frame": PointCloud, "odometry": Odometry, "goal": Goal, "truth": Truth}
+
+
+def test_an_unreachable_target_is_skipped_once(files: tuple[Path, str]) -> None:
+    simulator = make(files)
+
+    def plan(index: int, status: str) -> Plan:
+        nothing = np.empty((0, 2)), np.empty((0, 3))
+        return Plan(measured_at=index * STEP, path=nothing[0], trajectory=nothing[1], status=status)
+
+    first, _ = tick(simulator, 0)
+    simulator.on_plan(plan(0, "follow"))
+    same, _ = tick(simulator, 1)
+    simulator.on_plan(plan(1, "unreachable"))
+    second, _ = tick(simulator, 2)
+    simulator.on_plan(plan(1, "unreachable"))  # of the target before
+    still, ending = tick(simulator, 3)
+    assert [said.goal.index for said in (first, same, second, still)] == [0, 0, 1, 1]
+    assert ending == ""
+    simulator.on_plan(plan(3, "unreachable"))
+    _, ending = tick(simulator, 4)
+    assert ending == "tour finished"
+    summary = simulator.on_end()
+    assert (summary["reached"], summary["skipped"]) == (0, 2)
 
 
 def test_everything_it_says_passes_the_codec(files: tuple[Path, str]) -> None:
