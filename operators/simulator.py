@@ -70,7 +70,8 @@ class Simulator(Operator):
             odometry=c.odometry,
         )
         self.referee = Referee(self.world.targets, self.world.length, patience=c.patience, radius=c.goal_radius)
-        self.command = (0.0, 0.0)
+        self.command = (0.0, 0.0)  # in force since the last tick
+        self.coming = (0.0, 0.0)  # in force from the next tick on
         self.asked = (0, 0)  # index of the target asked for, and since which stamp
         self.now: int | None = None  # stamp of the last tick
         self.poses: dict[int, Matrix] = {}  # true world_from_base by stamp, for estimates still to come
@@ -80,8 +81,8 @@ class Simulator(Operator):
         rehearse()
 
     def on_drive(self, drive: Drive) -> None:
-        """Obey from the next tick on."""
-        self.command = (drive.linear, drive.angular)
+        """Obey from the next tick on: what it moves is seen at the tick after that."""
+        self.coming = (drive.linear, drive.angular)
 
     def on_pose(self, pose: Pose) -> None:
         """Judge what the robot believes against the truth of the same moment."""
@@ -106,7 +107,7 @@ class Simulator(Operator):
                     f"simulator.tick came after {seconds:g} s; the lidar wants timer/{world.spec.rate:g}hz"
                 )
             world.advance(*self.command, seconds)
-        self.now = now
+        self.now, self.command = now, self.coming
         state = world.state()
         self.poses = {stamp: pose for stamp, pose in self.poses.items() if stamp > now - REMEMBERED}
         self.poses[now] = state.world_from_base

@@ -136,6 +136,21 @@ def test_it_drives_until_the_tour_is_finished(files: tuple[Path, str]) -> None:
     msgspec.json.encode(summary)
 
 
+def test_a_command_moves_nothing_before_it_came(files: tuple[Path, str]) -> None:
+    simulator = make(files)
+
+    def x(index: int) -> float:
+        said, _ = tick(simulator, index)
+        assert said.truth is not None
+        return float(said.truth.world_from_base[0, 3])
+
+    before = [x(0), x(1)]
+    simulator.on_drive(Drive(measured_at=STEP, linear=1.0, angular=0.0))  # 100 ms later, with the next tick
+    at, after = x(2), x(3)
+    assert at - before[1] == pytest.approx(0.0, abs=1e-3)
+    assert after - at > 0.03
+
+
 def test_a_pose_is_judged_against_its_own_moment(files: tuple[Path, str]) -> None:
     simulator = make(files)
     simulator.on_drive(Drive(measured_at=0, linear=1.0, angular=0.0))
