@@ -17,7 +17,7 @@ from operators.kpconv.plan import WARM_UP, Plan
 from operators.kpconv.settings import Settings
 from operators.kpconv.spheres import IGNORED, SphereRecipe, augmentation, majority
 from operators.kpconv.training import Progress, Trainer
-from operators.kpconv.weights import Header, WeightsError, load, save
+from operators.kpconv.weights import Header, WeightsError, halved, load, save
 
 SMALL = msgspec.structs.replace(TINY, width=8)
 RANGE = Settings(network="rangenet", voxel=0.25, width=4, beams=16, columns=64, window=32)
@@ -186,6 +186,18 @@ def test_weights_come_back_and_say_what_differs(tmp_path: Path) -> None:
         load(path)
     with pytest.raises(WeightsError, match="no such file"):
         load(tmp_path / "nowhere.safetensors")
+
+
+def test_half_the_bits_are_a_smaller_file_of_the_same_network(tmp_path: Path) -> None:
+    network = SphereRecipe(SMALL).network()
+    whole, half = tmp_path / "whole.safetensors", tmp_path / "half.safetensors"
+    save(whole, network.state_dict(), Header(SMALL))
+    save(half, halved(network.state_dict()), Header(SMALL))
+    assert half.stat().st_size < 0.8 * whole.stat().st_size
+    back, _ = load(half)
+    for name, tensor in network.state_dict().items():
+        assert back.state_dict()[name].dtype == tensor.dtype
+        torch.testing.assert_close(back.state_dict()[name], tensor, rtol=1e-3, atol=1e-6)
 
 
 def test_optimizers_are_the_authors_or_adam(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from operators.kpconv.frames import Frames
 from operators.kpconv.plan import WARM_UP, Plan
 from operators.kpconv.settings import PRESETS, Settings
 from operators.kpconv.training import Group, Progress, Trainer
-from operators.kpconv.weights import Header, WeightsError, save
+from operators.kpconv.weights import Header, WeightsError, halved, save
 
 PREFERRED = "annotator/labelled"
 NUMBERS = ("batch", "seed", "check", "patience", "rate", "momentum", "decay", "balance")  # of a Plan
@@ -59,6 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1, help="of the CPU")
     parser.add_argument("--frames", type=int, default=MOST_FRAMES, help="kept in memory at most, evenly spread")
     parser.add_argument("--resume", action="store_true", help="go on from OUTPUT.checkpoint, if there is one")
+    parser.add_argument("--half", action="store_true", help="store the matrices in 16 bits: a file half as large")
     parser.add_argument("--json", action="store_true", help="print the outcome as JSON")
 
 
@@ -173,7 +174,8 @@ def run(args: argparse.Namespace) -> int:
             metrics=metrics,
             versions={name: version(name) for name in ("torch", "numpy", "numba")},
         )
-        save(args.output, trainer.weights(), header)
+        weights = trainer.weights()
+        save(args.output, halved(weights) if args.half else weights, header)
         args.output.with_suffix(".json").write_text(json.dumps(state.history, indent=1))
         draw_curves(state.history, args.output.with_suffix(".png"))
         checkpoint.unlink(missing_ok=True)

@@ -45,6 +45,11 @@ def recipe_of(settings: Settings) -> Recipe:
     return SphereRecipe(settings) if settings.network == "kpconv" else WindowRecipe(settings)
 
 
+def halved(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return the matrices in float16, half as large; biases and what batch norms keep stay as they are."""
+    return {name: tensor.half() if tensor.ndim > 1 else tensor for name, tensor in tensors.items()}
+
+
 def save(path: Path, tensors: dict[str, Tensor], header: msgspec.Struct) -> None:
     """Write tensors and their header; the old file stays until the new one is whole."""
     part = path.with_name(path.name + ".part")
