@@ -24,7 +24,7 @@ from graph.geometry import Matrix, transform
 from graph.graphfile import Edge, Graph, OperatorEntry
 from graph.ledger import Step
 from graph.loading import load_class
-from graph.messages import Drive, Goal, MapCloud, OccupancyGrid, Odometry, Plan, PointCloud, Pose, Text, Truth
+from graph.messages import Drive, Goal, MapCloud, OccupancyGrid, Odometry, Plan, PointCloud, Pose, Text, Tracks, Truth
 from graph.transport import free_port
 from operators.views.layout import Eye, eye_over, robot_layout
 from operators.views.palette import ESTIMATE, OTHERS, TRUE_POSE, Colour
@@ -51,6 +51,7 @@ class Display:
             Plan: self._plan,
             Goal: self._goal,
             Drive: self._drive,
+            Tracks: self._tracks,
             Text: self._text,
         }
         self.stamp = 0
@@ -147,6 +148,9 @@ class Display:
         self.scene.plan(name, plan.path, plan.trajectory)
         if self.news(name, "status", plan.status):
             self.scene.say(name, plan.status, "WARN" if plan.status in ("unreachable", "recover") else "INFO")
+
+    def _tracks(self, name: str, tracks: Tracks) -> None:
+        self.scene.tracks(name, tracks.position, tracks.velocity, tracks.identity)
 
     def _goal(self, name: str, goal: Goal) -> None:
         text = f"target {goal.index + 1} of {goal.count}"
@@ -268,6 +272,14 @@ class Dashboard(Sink):
     def on_map(self, map: MapCloud | None) -> None:
         """Add to the map what arrives of it; increments that are missed stay missed."""
         self.show("map", map)
+
+    def on_annotated(self, annotated: MapCloud | None) -> None:
+        """Show the map with what moves in it."""
+        self.show("annotated", annotated)
+
+    def on_tracks(self, tracks: Tracks | None) -> None:
+        """Show who is followed, and where they go."""
+        self.show("tracks", tracks)
 
     def on_occupancy(self, occupancy: OccupancyGrid | None) -> None:
         """Show the grid."""

@@ -111,6 +111,18 @@ class Scene:
         )
         self.stream.log(f"world/{name}/people", bodies)
 
+    def tracks(self, name: str, position: Points, velocity: Points, identity: Points) -> None:
+        """Draw the people that are followed: position (k, 2), velocity (k, 2) in m/s, number (k,)."""
+        high = np.full(len(position), 1.0)
+        arrows = rr.Arrows3D(
+            origins=np.column_stack([position, high]),
+            vectors=np.column_stack([velocity, 0.0 * high]),
+            colors=palette.TRAJECTORY,
+            radii=0.04,
+            labels=[str(number) for number in identity],
+        )
+        self.stream.log(f"world/{name}", arrows)
+
     def map(
         self,
         name: str,
