@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import queue
 import secrets
 import shutil
 import signal
@@ -20,6 +19,7 @@ from typing import IO, Any
 import msgspec
 
 from graph.graphfile import Graph
+from graph.inbox import Bell, Sample
 from graph.lockstep import endless
 from graph.merge import merge
 from graph.recording import Verdict
@@ -27,7 +27,7 @@ from graph.ring import reserve, retire
 from graph.run import Paths, describe
 from graph.status import StatusLine
 from graph.threads import environment
-from graph.transport import Sample, Wire, free_port
+from graph.transport import Wire, free_port
 from graph.wiring import NodeSpec, wire
 from graph.words import Boot, Control, SharedRing, State
 
@@ -48,13 +48,18 @@ class Outcome(msgspec.Struct):
     states: dict[str, Any]  # operator: steps, p50_ms, p95_ms, skipped
 
 
-def reserve_rings(specs: list[NodeSpec]) -> dict[str, SharedRing]:
-    """Reserve a ring for each topic that somebody listens to."""
+def reserve_rings(specs: list[NodeSpec], bells: dict[str, Bell]) -> dict[str, SharedRing]:
+    """Reserve a ring for each topic that somebody listens to; its writer rings the bells of its readers."""
     readers: dict[str, list[str]] = {}
     for spec in specs:
         for topic in dict.fromkeys(edge.topic for edge in spec.inputs if edge.period is None):
             readers.setdefault(topic, []).append(spec.name)
-    return {topic: SharedRing(reserve(len(names)), tuple(names)) for topic, names in readers.items()}
+    return {
+        topic: SharedRing(
+            reserve(len(names)), tuple(names), tuple(bells[name].ringing for name in names if name in bells)
+        )
+        for topic, names in readers.items()
+    }
 
 
 class Child:
@@ -70,7 +75,7 @@ class Child:
             stderr=subprocess.STDOUT,
             env={**os.environ, **environment(threads), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
             start_new_session=True,  # Ctrl-C is for the launcher alone
-            pass_fds=[ring.descriptor for ring in boot.rings.values()],
+            pass_fds=boot.descriptors(),
         )
         assert self.process.stdin is not None
         assert self.process.stdout is not None
@@ -131,7 +136,9 @@ class Launcher:
         self.reasons: list[str] = []
         self.interrupts = 0
         self.realtime = graph.clock.mode == "realtime"
-        self.rings = reserve_rings(self.specs) if host == LOOPBACK else {}
+        near = host == LOOPBACK
+        self.bells = {spec.name: Bell() for spec in self.specs if near and spec.kind != "sink" and spec.inputs}
+        self.rings = reserve_rings(self.specs, self.bells) if near else {}
 
     # processes
 
@@ -140,7 +147,8 @@ class Launcher:
         shard = self.paths.shards / f"{spec.name}.{incarnation}.mcap"
         mine = {f"{spec.name}/{port}" for port in spec.outputs} | {edge.topic for edge in spec.inputs}
         rings = {topic: ring for topic, ring in self.rings.items() if topic in mine}
-        boot = Boot(spec, self.endpoint, self.prefix, str(shard), incarnation, self.log_level, rings)
+        bell = self.bells[spec.name].ends if spec.name in self.bells else None
+        boot = Boot(spec, self.endpoint, self.prefix, str(shard), incarnation, self.log_level, rings, bell)
         self.shards.append(shard)
         self.children[spec.name] = Child(boot, spec.threads, self.paths.shards / f"{spec.name}.log", self.status.say)
 
@@ -155,10 +163,8 @@ class Launcher:
         """Take in the operators' reports for at most `timeout` seconds, and look after the children."""
         until = time.monotonic() + timeout
         while (left := until - time.monotonic()) > 0:
-            try:
-                self._take(self.wire.inbox.get(timeout=left))
-            except queue.Empty:
-                break
+            for sample in self.wire.inbox.take(left):
+                self._take(sample)
         self._look_after()
         self.status.show()
 
@@ -229,6 +235,8 @@ class Launcher:
             self.status.close()
             for ring in self.rings.values():
                 os.close(ring.descriptor)
+            for bell in self.bells.values():
+                bell.close()
 
     def _start(self) -> None:
         """Start all processes; nothing begins before every one has declared its ports."""

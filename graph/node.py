@@ -71,6 +71,7 @@ class Node:
         self.handlers = {port: getattr(operator, f"on_{port}") for port in ports.inputs}
         self.counts = dict.fromkeys(ports.outputs, 0)
         self.rings = rings or {}  # by output port
+        self.sizes = dict.fromkeys(ports.outputs, 0)  # of the last payloads, where there is a ring
         self.index = 0
         self.summary: Summary | None = None
         self.stream: Iterator[tuple[int, Any]] | None = None
@@ -197,20 +198,26 @@ class Node:
                 )
             sequence = self.counts[name]
             self.counts[name] = sequence + 1
-            yield Emission(name, sequence, stamp, *self._encoded(name, message))
+            yield self._encoded(Emission(name, sequence, stamp, b""), message)
 
-    def _encoded(self, port: str, message: msgspec.Struct) -> tuple[bytes | memoryview, int | None]:
-        """Encode a message where its readers find it: return the payload, and its place if that is in the ring."""
-        ring, place = self.rings.get(port), None
+    def _encoded(self, emission: Emission, message: msgspec.Struct) -> Emission:
+        """Encode a message where its readers find it: in the ring if it is large and there is room, else in bytes."""
+        port, place = emission.port, None
+        if (ring := self.rings.get(port)) is None:
+            return emission._replace(payload=encode_into(message, None))
 
         def room(size: int) -> memoryview | None:
             nonlocal place
-            if ring is None or size < LARGE or (found := ring.allocate(size)) is None:
+            self.sizes[port] = size
+            envelope = (self.incarnation, emission.sequence, emission.stamp)
+            if size < LARGE or (found := ring.allocate(size, envelope)) is None:
                 return None
             place, memory = found
             return memory
 
-        return encode_into(message, room), place
+        if self.sizes[port] >= LARGE:
+            ring.call()  # most likely this one is large too
+        return emission._replace(payload=encode_into(message, room), place=place)
 
     def _complaint(self, given: Any, port: str) -> str:
         wanted = "Outputs, End, None or an iterator of them" + (", or a Summary" if port == END else "")

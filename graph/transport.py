@@ -7,31 +7,20 @@ is never overtaken by the mark that announces it. Its own shared memory stays of
 
 from __future__ import annotations
 
-import queue
 import socket
 import struct
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import Self
 
 import msgspec
 import zenoh
 
+from graph.inbox import INLINE, Inbox, Sample
 from graph.ring import RingReader
 
 STALL = 30  # seconds that a stuck reader may take before its transport is closed
-INLINE = -1  # the place of a payload that travels with its message
 
 _ENVELOPE = struct.Struct("<IQqqI")  # incarnation, sequence, stamp; place in the ring and length
-
-
-class Sample(NamedTuple):
-    """What came in: data (`data/op/port`), a mark, a state, a control word; or a liveliness change."""
-
-    key: str
-    payload: bytes | memoryview
-    envelope: tuple[int, int, int]  # incarnation, sequence, stamp; zeros where there is none
-    alive: bool = True
-    mark: bytes = b""  # the mark that travels with the last messages of a call
 
 
 def free_port(host: str = "127.0.0.1") -> int:
@@ -63,10 +52,12 @@ def _configuration(mode: str, endpoint: str) -> zenoh.Config:
 class Wire:
     """A session: puts under a run's prefix, and everything subscribed to in one queue."""
 
-    def __init__(self, endpoint: str, prefix: str, *, router: bool = False) -> None:
+    def __init__(
+        self, endpoint: str, prefix: str, *, router: bool = False, bell: tuple[int, int] | None = None
+    ) -> None:
         self.session = zenoh.open(_configuration("router" if router else "client", endpoint))
         self.prefix = prefix
-        self.inbox: queue.SimpleQueue[Sample] = queue.SimpleQueue()
+        self.inbox = Inbox(bell)
         self.publishers: dict[str, zenoh.Publisher] = {}
         self.tokens: list[zenoh.LivelinessToken] = []
 
@@ -81,8 +72,9 @@ class Wire:
     def close(self) -> None:
         """Close the session; without it Zenoh's threads keep the process alive."""
         self.session.close()  # type: ignore[no-untyped-call]
+        self.inbox.bell.close()
 
-    def _receiver(self, key: str, ring: RingReader | None = None) -> zenoh.handlers.Callback[zenoh.Sample]:
+    def _receiver(self, key: str, copying: RingReader | None = None) -> zenoh.handlers.Callback[zenoh.Sample]:
         """Return a handler; it runs in a thread of Zenoh, so it does little. A key without wildcards is known ahead."""
         known = None if "*" in key else key
         skip, put = len(self.prefix) + 1, self.inbox.put
@@ -95,13 +87,18 @@ class Wire:
                 envelope = incarnation, sequence, stamp
                 mark = raw[_ENVELOPE.size :]
             name = known or str(sample.key_expr)[skip:]
-            payload = sample.payload.to_bytes() if place == INLINE or ring is None else ring.read(place, length)
-            put(Sample(name, payload, envelope, sample.kind == zenoh.SampleKind.PUT, mark))
+            payload: bytes | memoryview = sample.payload.to_bytes() if place == INLINE else b""
+            if place != INLINE and copying is not None:
+                payload, place = copying.read(place, length), INLINE
+            put(Sample(name, payload, envelope, sample.kind == zenoh.SampleKind.PUT, mark, place, length))
 
         return zenoh.handlers.Callback(receive, indirect=False)
 
     def subscribe(self, key: str, ring: RingReader | None = None) -> None:
         """Let everything put under a key (wildcards allowed) come into the inbox, large payloads from the ring."""
+        if ring is not None and not ring.copy:
+            self.inbox.expect(key, ring)
+            ring = None  # it is read where the inbox is emptied, and at once where that may take long
         self.session.declare_subscriber(f"{self.prefix}/{key}", self._receiver(key, ring))
 
     def watch(self, key: str) -> None:

@@ -16,6 +16,7 @@ class SharedRing(msgspec.Struct, frozen=True):
 
     descriptor: int
     readers: tuple[str, ...]  # operators, in the order of their counters
+    bells: tuple[int, ...] = ()  # descriptors that wake those readers who want it
 
 
 class Boot(msgspec.Struct):
@@ -28,6 +29,16 @@ class Boot(msgspec.Struct):
     incarnation: int = 0
     log_level: str = "warning"
     rings: dict[str, SharedRing] = {}  # by topic; none where others than our processes listen
+    bell: tuple[int, int] | None = None  # descriptors to hear and to ring its own
+
+    def descriptors(self) -> set[int]:
+        """Name all file descriptors that the process is to inherit."""
+        rings = self.rings.values()
+        return {
+            *(ring.descriptor for ring in rings),
+            *(bell for ring in rings for bell in ring.bells),
+            *(self.bell or ()),
+        }
 
 
 class Control(msgspec.Struct):

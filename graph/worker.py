@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import queue
 import signal
 import sys
 import threading
@@ -15,6 +14,7 @@ from pathlib import Path
 import msgspec
 
 from graph.errors import UserError
+from graph.inbox import INLINE, Sample
 from graph.ledger import INFINITY, Mark, Step
 from graph.lifeline import outlive_nobody, read_boot
 from graph.lockstep import GapError, Lockstep
@@ -24,7 +24,7 @@ from graph.realtime import Realtime
 from graph.ring import RingReader, RingWriter
 from graph.shard import Shard, schemas_of
 from graph.threads import set_threads
-from graph.transport import INLINE, Sample, Wire
+from graph.transport import Wire
 from graph.words import Boot, Control, Phase, State
 
 GAP_PATIENCE = 5.0  # seconds of the consumer's own running time
@@ -41,7 +41,7 @@ class Worker:
         self.boot, self.wire, self.spec = boot, wire, boot.spec
         set_threads(self.spec.threads)
         rings = {
-            topic.partition("/")[2]: RingWriter(ring.descriptor, len(ring.readers))
+            topic.partition("/")[2]: RingWriter(ring.descriptor, len(ring.readers), ring.bells)
             for topic, ring in boot.rings.items()
             if topic.partition("/")[0] == self.spec.name
         }
@@ -112,22 +112,18 @@ class Worker:
 
     def drain(self, timeout: float | None) -> bool:
         """Take in what has come, waiting at most `timeout` seconds for the first. Say whether anything came."""
-        inbox = self.wire.inbox
-        if timeout and inbox.empty():
-            try:
-                first = inbox.get(timeout=min(timeout, REST)) if self.shard.held else None
-            except queue.Empty:
+        took = False
+        if timeout and self.shard.held:
+            took = self._take_all(min(timeout, REST))
+            if not took:
                 self.shard.settle()
-                first = None
-            try:
-                self._take(first or inbox.get(timeout=timeout))
-            except queue.Empty:
-                return False
-        elif inbox.empty():
-            return False
-        while not inbox.empty():
-            self._take(inbox.get())
-        return True
+        return took or self._take_all(timeout or 0.0)
+
+    def _take_all(self, timeout: float) -> bool:
+        samples = self.wire.inbox.take(timeout)
+        for sample in samples:
+            self._take(sample)
+        return bool(samples)
 
     def _take(self, sample: Sample) -> None:
         kind, _, rest = sample.key.partition("/")
@@ -192,7 +188,10 @@ class Worker:
 
     def _put(self, emission: Emission, mark: bytes = b"") -> None:
         envelope = (self.boot.incarnation, emission.sequence, emission.stamp)
-        place = INLINE if emission.place is None else emission.place
+        place = INLINE
+        if emission.place is not None:
+            place = emission.place
+            self.node.rings[emission.port].publish(place, mark)
         self.wire.put(f"data/{self.spec.name}/{emission.port}", emission.payload, envelope, mark, place)
 
     def promise(self) -> None:
@@ -376,7 +375,7 @@ def main() -> int:
     outlive_nobody()
     logging.basicConfig(level=boot.log_level.upper(), format="%(levelname)s %(name)s: %(message)s")
     try:
-        with Wire(boot.endpoint, boot.prefix) as wire:
+        with Wire(boot.endpoint, boot.prefix, bell=boot.bell) as wire:
             Worker(boot, wire).run()
     except UserError as error:
         print(error, file=sys.stderr)

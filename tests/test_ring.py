@@ -13,15 +13,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graph import ring
-from graph.ring import RingReader, RingWriter, reserve, retire
+from graph.ring import Found, RingReader, RingWriter, reserve, retire
 
-SMALL = 1 << 10
+SMALL = 1 << 10  # bytes of the largest payload
+HEAD = 128
 
 
 @pytest.fixture(autouse=True, scope="module")
 def small() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ring, "SIZE", SMALL)
+        patch.setattr(ring, "SIZE", HEAD + SMALL)
         yield
 
 
@@ -110,6 +111,17 @@ def test_one_who_comes_later_begins_where_the_writer_is() -> None:
     assert reader.read(place, length) == b"b" * 1000
 
 
+def test_beginning_again_at_the_start_wastes_no_room() -> None:
+    descriptor = reserve(1)
+    writer, reader = RingWriter(descriptor, 1), RingReader(descriptor, 1, 0)
+    place, length = put(writer, b"a" * 300) or (0, 0)
+    reader.read(place, length)
+    assert put(writer, b"b" * 300) is not None
+    writer = RingWriter(descriptor, 1)  # died, and was brought back
+    assert put(writer, b"c" * 300) is not None
+    assert put(writer, b"d" * 300) is None
+
+
 def test_a_payload_larger_than_all_of_it_finds_no_room() -> None:
     descriptor = reserve(1)
     assert RingWriter(descriptor, 1).allocate(SMALL + 1) is None
@@ -118,9 +130,9 @@ def test_a_payload_larger_than_all_of_it_finds_no_room() -> None:
 def test_pieces_begin_on_a_cache_line_and_lie_apart() -> None:
     descriptor = reserve(1)
     writer = RingWriter(descriptor, 1)
-    places = [(put(writer, b"x" * 100) or (-1, 0))[0] for _ in range(8)]
+    places = [(put(writer, b"x" * 100) or (-1, 0))[0] for _ in range(4)]
     assert all(place % 64 == 0 for place in places)
-    assert all(later - earlier == 128 for earlier, later in pairwise(places))
+    assert all(later - earlier == 128 + HEAD for earlier, later in pairwise(places))
     assert writer.allocate(1) is None
 
 
@@ -137,7 +149,7 @@ print(bytes(reader.read(place, length)).decode())
 
 def test_another_process_reads_it() -> None:
     descriptor = reserve(1)
-    command = [sys.executable, "-c", PROGRAM, str(descriptor), str(SMALL)]
+    command = [sys.executable, "-c", PROGRAM, str(descriptor), str(HEAD + SMALL)]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, pass_fds=[descriptor]
     ) as other:
@@ -146,3 +158,51 @@ def test_another_process_reads_it() -> None:
         place, length = put(RingWriter(descriptor, 1), b"from here") or (0, 0)
         said, _ = other.communicate(f"{place} {length}\n", timeout=30)
     assert said == "from here\n"
+
+
+def test_the_newest_is_seen_from_its_beginning_until_it_is_let_go() -> None:
+    descriptor = reserve(1)
+    writer, reader = RingWriter(descriptor, 1), RingReader(descriptor, 1, 0)
+    place, memory = writer.allocate(100, (3, 7, 50)) or (0, memoryview(b""))
+    assert reader.look() == Found(place, 100, (3, 7, 50), None)
+    memory[:] = b"a" * 100
+    writer.publish(place, b"mark")
+    assert reader.look() == Found(place, 100, (3, 7, 50), b"mark")
+    held = reader.read(place, 100)
+    assert reader.look() == Found(place, 100, (3, 7, 50), b"mark")
+    del held
+    assert reader.look() is None
+
+
+def test_what_was_there_before_a_reader_came_is_not_seen() -> None:
+    descriptor = reserve(1)
+    writer = RingWriter(descriptor, 1)
+    put(writer, b"a" * 100)
+    assert RingReader(descriptor, 1, 0).look() is None
+
+
+def test_a_mark_that_finds_no_room_leaves_the_payload_to_zenoh() -> None:
+    descriptor = reserve(1)
+    writer, reader = RingWriter(descriptor, 1), RingReader(descriptor, 1, 0)
+    place, _ = writer.allocate(100) or (0, None)
+    writer.publish(place, b"m" * (ring.MARK + 1))
+    found = reader.look()
+    assert found is not None
+    assert found.mark is None
+    writer.publish(place, b"m" * ring.MARK)
+    found = reader.look()
+    assert found is not None
+    assert found.mark == b"m" * ring.MARK
+
+
+def test_bells_ring_when_a_payload_is_there_and_never_block() -> None:
+    descriptor, (hearing, ringing) = reserve(1), os.pipe()
+    for end in (hearing, ringing):
+        os.set_blocking(end, False)
+    writer = RingWriter(descriptor, 1, (ringing,))
+    place, _ = writer.allocate(100) or (0, None)
+    writer.publish(place, b"")
+    assert os.read(hearing, 10) == b"!"
+    for _ in range(1 << 17):  # more than a pipe holds
+        writer.call()
+    assert len(os.read(hearing, 1 << 20)) < 1 << 17
