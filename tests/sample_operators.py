@@ -179,6 +179,15 @@ class BlobMaker(Operator):
         return self.Outputs(Blob(measured_at=tick.measured_at, data=data))
 
 
+class BlobBurst(BlobMaker):
+    """Make several at each tick, small ones and large ones in any order."""
+
+    def on_tick(self, tick: Tick) -> Iterator[BlobMaker.Outputs]:  # type: ignore[override]
+        for size in self.generator.permutation(np.geomspace(1, self.config.size, 6).astype(int)):
+            data = self.generator.integers(0, 256, size, np.uint8)
+            yield self.Outputs(Blob(measured_at=tick.measured_at, data=data))
+
+
 class BlobRelay(Operator):
     """Pass bytes on, each plus `offset`."""
 

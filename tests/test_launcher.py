@@ -44,6 +44,16 @@ operators:
 """
 
 
+BURSTS = """
+clock: {mode: lockstep, duration: 2s}
+operators:
+  maker: {run: tests.sample_operators:BlobBurst, inputs: {tick: timer/10hz}, config: {size: 3000000}, record: digest}
+  relay: {run: tests.sample_operators:BlobRelay, inputs: {blob: maker/blob}, record: digest}
+  again: {run: tests.sample_operators:BlobRelay, inputs: {blob: relay/blob}, record: digest}
+  aside: {run: tests.sample_operators:BlobRelay, inputs: {blob: maker/blob}, record: digest}
+"""
+
+
 def start(graph: Path, recording: Path, *more: str, **environment: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "graph.cli", "launch", str(graph), "--record", str(recording), *more]
     return subprocess.Popen(
@@ -124,6 +134,19 @@ def test_launches_are_equal_under_load_with_other_hashes_paced_and_in_one_proces
     assert replay(plain).equal
     for path in paths.values():
         assert compare(plain, Recording(path)).equal, path
+
+
+def test_small_and_large_messages_in_any_order_are_the_same_in_rings_and_without(
+    graph_file: Write, tmp_path: Path
+) -> None:
+    graph = graph_file(BURSTS)
+    code, out, err = run(graph, tmp_path / "rings.mcap")
+    assert code == 0, out + err
+    assert run(graph, tmp_path / "without.mcap", "--in-process")[0] == 0
+    rings = Recording(tmp_path / "rings.mcap")
+    assert compare(rings, Recording(tmp_path / "without.mcap")).equal
+    assert replay(rings).equal
+    assert sum(len(step.emitted) for _, _, step in rings.steps("again")) == 6 * 21
 
 
 def test_an_operator_that_is_stopped_for_two_seconds_changes_nothing(graph_file: Write, tmp_path: Path) -> None:
