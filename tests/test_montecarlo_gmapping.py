@@ -11,7 +11,7 @@ from test_montecarlo_filter import room, scan_from, seen
 from operators.montecarlo import Gmapping, Settings
 from operators.montecarlo.matching import NO_HIT, climb, judge
 from operators.montecarlo.motion import Spread, compose, shake
-from operators.montecarlo.patches import FULL, HITS, SIDE, Patches, X, Y
+from operators.montecarlo.patches import FULL, SIDE, Patches, X, Y
 
 SENSOR = np.zeros(2)
 
@@ -54,6 +54,26 @@ def test_maps_share_patches_until_one_writes():
     assert patches.in_use() == used  # what nobody shows is free again
 
 
+def test_a_scan_is_entered_into_each_map_at_its_own_pose():
+    ends, hits, sensor = np.random.default_rng(3).uniform(-4, 4, (40, 2)), np.ones(40, np.bool_), np.array([0.1, 0.0])
+    poses = np.array([[0.5, -0.3, 0.7], [90.0, 2.0, -2.0]])
+    each, single = Patches(2, 0.05), Patches(1, 0.05)
+    each.enter_each(poses, sensor, ends, hits)
+    x, y, heading = poses[1]
+    turn = np.array([[math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]])
+    single.enter(0, sensor @ turn + (x, y), ends @ turn + (x, y), hits)
+    for known, found in zip(single.dense(0), each.dense(1), strict=True):
+        assert known[known > 0].tolist() == found[found > 0].tolist()
+
+
+def test_the_bits_of_a_row_say_which_cells_are_often_hit():
+    patches = entered(1, beams=400)
+    hits, visits = patches.dense(0)
+    rows = patches.store.often[patches.directory[0]].transpose(0, 2, 1).reshape(hits.shape[0], -1)
+    bits = (rows[:, :, None] >> np.arange(SIDE, dtype=np.uint32)) & 1
+    assert np.array_equal(bits.reshape(hits.shape), hits > FULL * visits)
+
+
 def test_a_map_grows_without_forgetting():
     patches = entered()
     ends, far = patches.dense(0)[0].sum(), np.array([[60.0, -70.0]])
@@ -69,7 +89,7 @@ def plain_judge(patches: Patches, pose, ends, sigma: float, logarithmic: bool) -
 
     def mean(x, y):
         place = directory[y // SIDE, x // SIDE], (y % SIDE) * SIDE + x % SIDE
-        return np.array([x * 0.05, y * 0.05]) + store.ends[place][[X, Y]] / store.ends[place][HITS]
+        return np.array([x * 0.05, y * 0.05]) + store.ends[place][[X, Y]]
 
     total, (cosine, sine) = 0.0, (math.cos(pose[2]), math.sin(pose[2]))
     for beam in ends:
@@ -168,5 +188,7 @@ def test_scans_without_returns_are_no_scans_and_settings_that_fit_nothing_are_re
     assert gmapping.scans == 0
     with pytest.raises(ValueError, match="delta"):
         Gmapping(Settings(delta=0.0))
+    with pytest.raises(ValueError, match="kernelSize of 0 to 3"):
+        Gmapping(Settings(kernelSize=4))
     with pytest.raises(ValueError, match="particle"):
         Gmapping(Settings(particles=0))

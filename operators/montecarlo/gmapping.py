@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from graph.geometry import wrap
 from operators.montecarlo.map_file import FREE, OCCUPIED, UNKNOWN, GridMap
-from operators.montecarlo.matching import climb, judge
+from operators.montecarlo.matching import MOST_KERNEL, match
 from operators.montecarlo.motion import Spread, compose, difference, shake
 from operators.montecarlo.patches import Patches
 from operators.montecarlo.resampling import effective, systematic
@@ -68,8 +68,11 @@ class Gmapping:
         self, settings: Settings | None = None, *, start: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ) -> None:
         self.settings = s = Settings() if settings is None else settings
-        if s.particles < 1 or s.iterations < 0 or s.lskip < 0 or s.kernelSize < 0:
-            raise ValueError("gmapping wants at least one particle, and no negative iterations, lskip or kernelSize")
+        if s.particles < 1 or s.iterations < 0 or s.lskip < 0 or not 0 <= s.kernelSize <= MOST_KERNEL:
+            raise ValueError(
+                f"gmapping wants at least one particle, no negative iterations or lskip, and a kernelSize of 0 to "
+                f"{MOST_KERNEL}; given are {s.particles}, {s.iterations}, {s.lskip} and {s.kernelSize}"
+            )
         if not min(s.delta, s.sigma, s.lsigma, s.ogain, s.lstep, s.astep, s.maxUrange) > 0.0:
             raise ValueError("gmapping wants delta, sigma, lsigma, ogain, lstep, astep and maxUrange above 0")
         self.rng = np.random.default_rng(s.seed)
@@ -113,18 +116,15 @@ class Gmapping:
 
     def _match(self, ends: Doubles, sensor: Doubles) -> None:
         """Move each particle to where the scan fits its map best, and weigh it by how well it fits there."""
-        s = self.settings
-        corner = np.append(self.patches.origin, 0.0)
-        for index in range(s.particles):
-            scene = (self.patches.directory[index], self.patches.store)
-            beams = (ends, sensor, s.delta, s.kernelSize)
-            start = self.poses[index] - corner
-            matched, score = climb(*scene, start, *beams, s.sigma, s.lstep, s.astep, s.iterations)
-            pose = matched if score > s.minimumScore else start
-            likelihood = judge(*scene, pose, *beams, s.lsigma, True)
-            self.poses[index] = pose + corner
-            self.logs[index] += likelihood
-            self.sums[index] += likelihood
+        s, corner = self.settings, np.append(self.patches.origin, 0.0)
+        poses = self.poses - corner
+        likelihoods = match(
+            *(self.patches.directory, self.patches.store, poses, ends, sensor, s.delta, s.kernelSize),
+            *(s.sigma, s.lstep, s.astep, s.iterations, s.minimumScore, s.lsigma),
+        )
+        self.poses = poses + corner
+        self.logs += likelihoods
+        self.sums += likelihoods
         self.poses[:, 2] = wrap(self.poses[:, 2])
 
     def _resample(self) -> bool:
@@ -144,11 +144,7 @@ class Gmapping:
 
     def _register(self, ends: Doubles, sensor: Doubles) -> None:
         """Enter the scan into the map of each particle, at its pose."""
-        hits = np.ones(len(ends), np.bool_)
-        for index in range(self.settings.particles):
-            x, y, heading = self.poses[index].tolist()
-            turn = np.array([[math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]])
-            self.patches.enter(index, sensor @ turn + (x, y), ends @ turn + (x, y), hits)
+        self.patches.enter_each(self.poses, sensor, ends, np.ones(len(ends), np.bool_))
         self.scans += 1
 
     def grid(self, index: int | None = None) -> GridMap:

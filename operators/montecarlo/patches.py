@@ -11,21 +11,22 @@ from numba import njit
 
 Doubles = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
+Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int32]
 
 BITS = 5
 SIDE = 1 << BITS  # cells along a patch
 FULL = 0.1  # share of hits from which a cell counts as occupied when scans are matched
-HITS, X, Y = 0, 1, 2  # of a cell: end points in it, and the sums of their offsets (metres)
-NEVER, SELDOM, OFTEN = 0, 1, 2  # how many of the beams that met a cell ended there
+HITS, X, Y = 0, 1, 2  # of a cell: end points in it, and the means of their offsets (metres)
+LAST = SIDE - 1
 
 
 class Store(NamedTuple):
     """The arrays of all maps; patch 0 is the empty one, never written."""
 
     ends: Floats  # (patches, SIDE * SIDE, 3)
-    visits: Floats  # (patches, SIDE * SIDE) beams that met the cell; apart, as rays touch little else
-    state: npt.NDArray[np.uint8]  # (patches, SIDE * SIDE) NEVER, SELDOM or OFTEN
+    visits: npt.NDArray[np.uint32]  # (patches, SIDE * SIDE) twice the beams that met a cell, odd once one ended there
+    often: npt.NDArray[np.uint32]  # (patches, SIDE) a bit for each cell of a row that counts as occupied
     users: Ints  # (patches,) maps that show the patch
     free: Ints  # (patches,) stack of unused patches
     top: Ints  # (1,) height of the stack
@@ -74,7 +75,7 @@ class Patches:
         count = len(store.users)
         larger = _store(count + max(missing, count // 2))
         larger.ends[:count], larger.visits[:count] = store.ends, store.visits
-        larger.state[:count], larger.users[:count] = store.state, store.users
+        larger.often[:count], larger.users[:count] = store.often, store.users
         added = np.arange(len(larger.users) - 1, count - 1, -1, dtype=np.int32)
         top = int(store.top[0])
         larger.free[: len(added)] = added
@@ -87,23 +88,42 @@ class Patches:
         """Return the world coordinates (2,) of the maps' corner, metres."""
         return np.asarray(self.corner * (SIDE * self.resolution), np.float64)
 
-    def enter(self, index: int, sensor: Doubles, ends: Doubles, hits: npt.NDArray[np.bool_]) -> None:
+    def enter(self, index: int, sensor: Doubles, ends: Doubles, hits: Flags) -> None:
         """Enter a scan into a map: beams from sensor (2,) to ends (n, 2) in the world, which hit something or not."""
+        if len(ends):
+            self.reserve(self._room(np.concatenate([ends, sensor[None]])))
+            _enter(self.directory[index], self.store, sensor - self.origin, ends - self.origin, hits, self.resolution)
+
+    def enter_each(self, poses: Doubles, sensor: Doubles, ends: Doubles, hits: Flags) -> None:
+        """Enter a scan into each map at its own pose (maps, 3); sensor (2,) and ends (n, 2) are in the base frame."""
         if not len(ends):
             return
-        both = np.concatenate([ends, sensor[None]])
-        low, high = both.min(axis=0), both.max(axis=0)
+        reach = math.sqrt(max((ends**2).sum(axis=1).max(), (sensor**2).sum()))
+        places = poses[:, :2]
+        self.cover(places.min(axis=0) - reach, places.max(axis=0) + reach)
+        wanted = int(2.0 * reach / (SIDE * self.resolution) + 2.0) ** 2
+        entered = 0
+        while entered < len(poses):
+            self.reserve(wanted)
+            corner = np.append(self.origin, 0.0)
+            local = poses - corner
+            entered = _enter_each(
+                self.directory, self.store, local, sensor, ends, hits, self.resolution, entered, wanted
+            )
+
+    def _room(self, points: Doubles) -> int:
+        """Let all maps reach over points (n, 2); returns how many patches these may touch at most."""
+        low, high = points.min(axis=0), points.max(axis=0)
         self.cover(low, high)
         spread = np.floor((high - low) / (SIDE * self.resolution)) + 2
-        self.reserve(int(spread[0] * spread[1]))
-        _enter(self.directory[index], self.store, sensor - self.origin, ends - self.origin, hits, self.resolution)
+        return int(spread[0] * spread[1])
 
     def dense(self, index: int) -> tuple[Floats, Floats]:
         """Return how many beams ended in each cell of one map and how many met it, each (rows, columns)."""
         _, rows, columns = self.directory.shape
         places = self.directory[index]
         both = []
-        for values in (self.store.ends[places, :, HITS], self.store.visits[places]):
+        for values in (self.store.ends[places, :, HITS], (self.store.visits[places] >> 1).astype(np.float32)):
             tiles = values.reshape(rows, columns, SIDE, SIDE).transpose(0, 2, 1, 3)
             both.append(np.ascontiguousarray(tiles).reshape(rows * SIDE, columns * SIDE))
         return both[0], both[1]
@@ -116,8 +136,8 @@ class Patches:
 def _store(count: int) -> Store:
     store = Store(
         np.zeros((count, SIDE * SIDE, 3), np.float32),
-        np.zeros((count, SIDE * SIDE), np.float32),
-        np.zeros((count, SIDE * SIDE), np.uint8),
+        np.zeros((count, SIDE * SIDE), np.uint32),
+        np.zeros((count, SIDE), np.uint32),
         np.zeros(count, np.int32),
         np.zeros(count, np.int32),
         np.array([count - 1], np.int32),
@@ -143,17 +163,16 @@ def _count(directory: Ints, store: Store) -> None:
 
 @njit(cache=True)
 def _own(directory: Ints, store: Store, row: int, column: int) -> int:
-    """Return the patch that a map may write at a place of its directory (rows, columns): a new one, a copy, its own."""
+    """Give a map a patch of its own at a place of its directory (rows, columns): a new one, or a copy; returns it."""
     patch = directory[row, column]
-    if patch != 0 and store.users[patch] == 1:
-        return patch
     store.top[0] -= 1
     own = store.free[store.top[0]]
     for place in range(SIDE * SIDE):
-        store.state[own, place] = store.state[patch, place]
         store.visits[own, place] = store.visits[patch, place]
         for value in range(3):
             store.ends[own, place, value] = store.ends[patch, place, value]
+    for line in range(SIDE):
+        store.often[own, line] = store.often[patch, line]
     if patch != 0:
         store.users[patch] -= 1
     store.users[own] = 1
@@ -162,41 +181,77 @@ def _own(directory: Ints, store: Store, row: int, column: int) -> int:
 
 
 @njit(cache=True, error_model="numpy")
-def _enter(
-    directory: Ints, store: Store, sensor: Doubles, ends: Doubles, hits: npt.NDArray[np.bool_], resolution: float
-) -> None:
-    """Count a visit of each cell along each beam (Bresenham 1965), and the hit at its end."""
-    scale, met, visits, state = 1.0 / resolution, store.ends, store.visits, store.state
-    x0, y0 = math.floor(sensor[0] * scale), math.floor(sensor[1] * scale)
+def _enter_each(
+    directories: Ints,
+    store: Store,
+    poses: Doubles,
+    sensor: Doubles,
+    ends: Doubles,
+    hits: Flags,
+    resolution: float,
+    first: int,
+    wanted: int,
+) -> int:
+    """Enter a scan at each pose from the first on; returns the one for which fewer than `wanted` patches are left."""
+    here, there = np.empty(2), np.empty_like(ends)
+    for index in range(first, len(poses)):
+        if store.top[0] < wanted:
+            return index
+        x, y, cosine, sine = poses[index, 0], poses[index, 1], math.cos(poses[index, 2]), math.sin(poses[index, 2])
+        here[0], here[1] = x + cosine * sensor[0] - sine * sensor[1], y + sine * sensor[0] + cosine * sensor[1]
+        for beam in range(len(ends)):
+            there[beam, 0] = x + cosine * ends[beam, 0] - sine * ends[beam, 1]
+            there[beam, 1] = y + sine * ends[beam, 0] + cosine * ends[beam, 1]
+        _enter(directories[index], store, here, there, hits, resolution)
+    return len(poses)
+
+
+@njit(cache=True, error_model="numpy")
+def _enter(directory: Ints, store: Store, sensor: Doubles, ends: Doubles, hits: Flags, resolution: float) -> None:
+    """Count a visit of each cell along each beam (Bresenham 1965), and the hit at its end.
+
+    x and y count within a patch, row and column are the patch's; a step out of it carries over.
+    """
+    scale, met, often, users = 1.0 / resolution, store.ends, store.often, store.users
+    visits = store.visits.reshape(-1)  # by unsigned places, which numba takes without asking whether they are negative
+    x0, y0 = np.int64(math.floor(sensor[0] * scale)), np.int64(math.floor(sensor[1] * scale))
     for beam in range(len(ends)):
         ex, ey = ends[beam, 0] * scale, ends[beam, 1] * scale
-        x1, y1 = math.floor(ex), math.floor(ey)
+        x1, y1 = np.int64(math.floor(ex)), np.int64(math.floor(ey))
         dx, dy = abs(x1 - x0), abs(y1 - y0)
         sx = 1 if x0 < x1 else -1
         sy = 1 if y0 < y1 else -1
-        error = dx - dy
+        steep = dy > dx
+        longer, shorter = (dy, dx) if steep else (dx, dy)
+        along_x, along_y = (0, sy) if steep else (sx, 0)  # each step
+        aside_x, aside_y = (sx, 0) if steep else (0, sy)  # now and then
+        error = longer >> 1
+        row, column, patch = np.int64(0), np.int64(0), np.int64(0)
         x, y = x0, y0
-        last_row = last_column = -1
-        patch = 0
-        for _ in range(max(dx, dy) + 1):
-            row, column = y >> BITS, x >> BITS
-            if row != last_row or column != last_column:
-                patch = _own(directory, store, row, column)
-                last_row, last_column = row, column
-            place = ((y & (SIDE - 1)) << BITS) | (x & (SIDE - 1))
-            visits[patch, place] += np.float32(1.0)
-            if x == x1 and y == y1 and hits[beam]:
+        for step in range(longer + 1):
+            if (x | y) & ~LAST or not step:
+                row, column = row + (y >> BITS), column + (x >> BITS)
+                x, y = x & LAST, y & LAST
+                patch = np.int64(directory[row, column])
+                if patch == 0 or users[patch] != 1:
+                    patch = np.int64(_own(directory, store, row, column))
+            place = (y << BITS) | x
+            beams = visits[np.uint64((patch << (2 * BITS)) | place)] + np.uint32(2)
+            if step == longer and hits[beam]:
+                beams |= np.uint32(1)
                 met[patch, place, HITS] += np.float32(1.0)
-                met[patch, place, X] += np.float32((ex - x1) * resolution)
-                met[patch, place, Y] += np.float32((ey - y1) * resolution)
-                state[patch, place] = SELDOM
-            if state[patch, place] != NEVER:
-                often = met[patch, place, HITS] > FULL * visits[patch, place]
-                state[patch, place] = OFTEN if often else SELDOM
-            twice = 2 * error
-            if twice > -dy:
-                error -= dy
-                x += sx
-            if twice < dx:
-                error += dx
-                y += sy
+                share = np.float32(1.0) / met[patch, place, HITS]
+                met[patch, place, X] += share * (np.float32((ex - x1) * resolution) - met[patch, place, X])
+                met[patch, place, Y] += share * (np.float32((ey - y1) * resolution) - met[patch, place, Y])
+            visits[np.uint64((patch << (2 * BITS)) | place)] = beams
+            if beams & np.uint32(1):
+                bit = np.uint32(1) << np.uint32(x)
+                if met[patch, place, HITS] > FULL * (beams >> np.uint32(1)):
+                    often[patch, y] |= bit
+                else:
+                    often[patch, y] &= ~bit
+            error -= shorter
+            turn = error >> 63  # all bits where the error is negative, else none
+            error += longer & turn
+            x += along_x + (aside_x & turn)
+            y += along_y + (aside_y & turn)
