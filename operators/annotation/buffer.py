@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from operators.annotation.floor import Booleans, floor_points
+from operators.annotation.pieces import NOWHERE, flat_pieces, share_of_piece
 from operators.annotation.session import (
     GROUND,
     LONG_TERM,
@@ -42,8 +43,8 @@ class Classing(NamedTuple):
     ring: float = 0.10  # metres around the map, and around what can move
     thickness: float = 0.04  # metres from the plane of the nearest permanent point
     alike: float = 0.8  # cosine between its normal and that of the point that joins
-    growth: float = 0.12  # metres along it, at each step
-    steps: int = 1
+    growth: float = 0.15  # metres along it
+    piece: float = 0.6  # share of a flat piece; where so much of it joins all of it does, and none of it where less
 
 
 class KnownMap(NamedTuple):
@@ -189,22 +190,18 @@ def extend_along_planes(known: KnownMap, new: MapPoints, labels: Labels, setting
     """Call permanent what continues the planes of the known: holes in walls close, what stands before them stays out.
 
     A new point that nobody saw through joins when the nearest permanent point is near, its plane passes through the
-    point, and both face the same way; a few steps close the hole that a cupboard left. Ground does not grow: it would
-    climb up the legs of the furniture.
+    point, and both face the same way. What is flat belongs together: the edge of a hole in a wall is nearly all of its
+    piece, the edge of a shut door is a small part. Ground does not grow: it would climb up the legs of the furniture.
     """
     candidates = np.flatnonzero(labels != SHORT_TERM)
-    front, points, normals = known.voxels, known.voxels.points, known.voxels.normals
     upright = known.labels == PERMANENT
-    for _ in range(settings.steps):
-        if not len(candidates) or not upright.any():
-            return
-        found, _ = front.nearest(new.points[candidates], settings.growth)
-        near = (found >= 0) & upright[found]
-        candidates_near, nearest = candidates[near], found[near]
-        apart = ((new.points[candidates_near] - points[nearest]) * normals[nearest]).sum(axis=1)
-        alike = np.abs((new.normals[candidates_near] * normals[nearest]).sum(axis=1)) > settings.alike
-        joins = candidates_near[alike & (np.abs(apart) < settings.thickness)]
-        labels[joins] = PERMANENT
-        front = subset(new, np.isin(np.arange(len(labels)), joins))
-        points, normals, upright = front.points, front.normals, np.ones(len(front), np.bool_)
-        candidates = candidates[labels[candidates] != PERMANENT]
+    if not len(candidates) or not upright.any():
+        return
+    points, normals = new.points[candidates], new.normals[candidates]
+    found, _ = known.voxels.nearest(points, settings.growth)
+    offset = ((points - known.voxels.points[found]) * known.voxels.normals[found]).sum(axis=1)
+    alike = np.abs((normals * known.voxels.normals[found]).sum(axis=1)) > settings.alike
+    joins = (found >= 0) & upright[found] & alike & (np.abs(offset) < settings.thickness)
+    pieces = flat_pieces(points, normals)
+    joins = np.where(pieces == NOWHERE, joins, share_of_piece(pieces, joins) >= settings.piece)
+    labels[candidates[joins]] = PERMANENT

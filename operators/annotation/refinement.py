@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from operators.annotation.floor import floor_points
+from operators.annotation.pieces import flat_pieces, length_of_piece, share_of_piece
 from operators.annotation.session import Floats, Session
 from operators.pointmap import MapPoints, VoxelMap, find_ground
 from operators.pointray import PointRay, RaySettings
@@ -20,6 +21,8 @@ class Refinement(NamedTuple):
     threshold: float = 0.9  # movable probability; high, for what is missed now will be caught by another session
     tolerance: float = 0.10  # metres; ground never leaves
     clearance: float = 0.10
+    piece: float = 0.2  # share of a flat piece; where so much of it leaves, the rest leaves too
+    longest: float = 3.0  # metres of such a piece: longer ones are walls
 
 
 def trace_map(voxels: VoxelMap, session: Session, rays: RaySettings) -> tuple[Floats, npt.NDArray[np.int32]]:
@@ -36,13 +39,18 @@ def refine(
 ) -> tuple[MapPoints, npt.NDArray[np.bool_]]:
     """Return the map without what any session saw through, and which points stayed.
 
-    movable: probabilities (n,) of the points of the map, one array for each accepted session. Ground always stays.
+    movable: probabilities (n,) of the points of the map, one array for each accepted session. Ground always stays. What
+    is flat moves as one: of the leaf of a door that turned a little, the half by the hinges is where it was, and one
+    that was shut hides the place where it stood open.
     """
     settings = Refinement() if settings is None else settings
     worst = np.zeros(len(cloud.points), np.float32)
     for probabilities in movable:
         worst = np.maximum(worst, probabilities)
     stays = worst < settings.threshold
+    pieces = flat_pieces(cloud.points, cloud.normals)
+    follows = share_of_piece(pieces, ~stays) >= settings.piece
+    stays &= ~(follows & (length_of_piece(pieces, cloud.points) <= settings.longest))
     plane = find_ground(cloud.points, cloud.normals)
     if plane is not None:
         stays |= floor_points(cloud.points, plane, settings.tolerance, settings.clearance)
