@@ -16,7 +16,7 @@ from graph.errors import UserError
 from operators.rounds import experiment_command, rounds_command
 from operators.rounds.experiment_command import Experiment
 from operators.rounds.report import page, summarize
-from operators.rounds.schedule import Schedule, Session
+from operators.rounds.schedule import SCENARIOS, Schedule, Session
 from operators.rounds.tally import Track, box, driven_into, driving, poisson_interval, success_table
 from operators.rounds.variants import listening_graph, session_graph, written
 
@@ -26,7 +26,7 @@ BUILDING = str(ROOT / "operators" / "rounds" / "cabin.yaml")
 
 def test_sixty_sessions_and_those_with_people_predicted_have_seeds_of_their_own():
     groups = Schedule(rounds=4).groups()
-    assert [len(group) for group in groups] == [12] * 6
+    assert [len(group) for group in groups] == [12] * 6 + [4]
     assert sum(len(group) for group in groups[:5]) == 60
     sessions = [Schedule(rounds=4).mapping(), *(session for group in groups for session in group)]
     others = [session for group in Schedule(rounds=4, seed=2).groups() for session in group]
@@ -43,9 +43,16 @@ def test_labels_are_none_then_the_networks_then_true():
         {"network"},
         {"truth"},
         {"network"},
+        {"network"},
     ]
-    assert {session.people for group in groups[:-1] for session in group} == {"ignore"}
-    assert {session.people for session in groups[-1]} == {"predict"}
+    assert {session.people for group in [*groups[:-2], groups[-1]] for session in group} == {"ignore"}
+    assert {session.people for session in groups[-2]} == {"predict"}
+
+
+def test_another_lidar_drives_one_tour_of_each_scenario():
+    sessions = Schedule(rounds=2).lidar()
+    assert [(session.scenario, session.tour) for session in sessions] == [(name, "A") for name in SCENARIOS]
+    assert Schedule(rounds=1).lidar() == []
 
 
 def test_hardest_tours_can_be_driven_again():

@@ -18,11 +18,12 @@ import numpy as np
 
 from graph.errors import UserError
 from operators.rounds.report import page, summarize
-from operators.rounds.schedule import TRUTH, Labels, Schedule, Session
+from operators.rounds.schedule import LIDAR, TRUTH, Labels, Schedule, Session
 from operators.rounds.session_command import keep_picture, launch, read_json, record_of, verb, write_json
 from operators.rounds.variants import listening_graph, robot, session_graph, written
 
 MOST_DISK = 20.0  # GB
+OTHER_LIDAR = {"lidar": "hdl32e", "rolling": True, "dropout": 0.2}  # twice the columns, one after the other, with gaps
 VERSIONS = ("numpy", "numba", "scipy", "torch", "pybullet", "embreex", "eclipse-zenoh", "mcap")
 
 
@@ -82,6 +83,7 @@ class Experiment:
             self.report()
         self.drive(self.schedule.truth())
         self.drive(self.schedule.predict())
+        self.drive(self.schedule.lidar())
         self.evaluate()
         self.compare()
         return self.report(final=True)
@@ -198,7 +200,7 @@ class Experiment:
             map_file=None if session.group == "mapping" else self.relative(self.map_before(number)),
             weights=None if weights is None else self.relative(weights),
             threads=self.settings.threads,
-            lidar={} if self.settings.lidar == "paper" else {"lidar": self.settings.lidar},
+            lidar=OTHER_LIDAR if session.group == LIDAR else {"lidar": self.settings.lidar},
         )
 
     def relative(self, path: Path) -> str:

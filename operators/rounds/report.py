@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from operators.rounds import figures
+from operators.rounds.schedule import LIDAR, PREDICT
 from operators.rounds.tally import PAPER, boxes, driving, success_table
 
 Record = dict[str, Any]
@@ -27,18 +28,22 @@ def summarize(told: Record) -> Record:
     records: list[Record] = told["sessions"]
     groups = list(dict.fromkeys(item["group"] for item in records))
     scenarios = told["settings"]["scenarios"]
-    main = [group for group in groups if group != "predict"]
+    main = [group for group in groups if group not in (PREDICT, LIDAR)]
+    others = {
+        group: success_table(records, [group], scenarios) if group in groups else [] for group in (PREDICT, LIDAR)
+    }
     compared: list[Record] = told.get("comparison", [])
     labels = list(dict.fromkeys(item["group"] for item in compared))
     hours = sum(item["seconds"] for item in told["stages"]) / 3600.0
     return {
         **told,
         "success": success_table(records, main, scenarios),
-        "success_predict": success_table(records, ["predict"], scenarios) if "predict" in groups else [],
+        "success_predict": others[PREDICT],
+        "success_lidar": others[LIDAR],
         "paper": {
             name: dict(zip(("easy", "medium", "hard", "extreme"), row, strict=True)) for name, row in PAPER.items()
         },
-        "errors_cm": boxes(records, main, scenarios),
+        "errors_cm": boxes(records, [*main, *(group for group in (LIDAR,) if group in groups)], scenarios),
         "comparison_cm": boxes(compared, labels, scenarios),
         "driving": driving(records, groups, scenarios),
         "failed": [
@@ -137,6 +142,12 @@ def page(told: Record, picture: dict[str, Any] | None = None) -> str:
         parts += [
             "<p>Keeping clear of where people will be (<code>people: predict</code>):</p>",
             table(head, success_rows(told, told["success_predict"], paper=False)),
+        ]
+    if told["success_lidar"]:
+        parts += [
+            "<p>One tour each with another lidar, an HDL-32E: columns one after the other, up to a fifth of the "
+            "returns lost at grazing incidence and far away:</p>",
+            table(head, success_rows(told, told["success_lidar"], paper=False)),
         ]
     if told["failed"]:
         lines = [

@@ -129,6 +129,7 @@ def brief(told: dict[str, Any], folder: Path) -> dict[str, Any]:
     names = (
         "success",
         "success_predict",
+        "success_lidar",
         "paper",
         "errors_cm",
         "comparison_cm",
@@ -144,7 +145,7 @@ def text(told: dict[str, Any], folder: Path) -> str:
     """Say the outcome in lines."""
     scenarios = told["settings"]["scenarios"]
     lines = [f"{'':>10} " + " ".join(f"{name:>9}" for name in scenarios)]
-    for row in [*told["success"], *told["success_predict"]]:
+    for row in [*told["success"], *told["success_predict"], *told["success_lidar"]]:
         cells = [row["cells"][name] for name in scenarios]
         shown = [
             f"{cell['success']:.0f} %{'*' if cell['completed'] else ' '}" if cell["sessions"] else "-" for cell in cells

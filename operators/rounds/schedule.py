@@ -9,14 +9,14 @@ Labels = Literal["none", "network", "truth"]
 SCENARIOS = ("easy", "medium", "hard", "extreme")
 TOURS = ("A", "B", "C")
 FEWEST, MOST_ROUNDS = 1, 9  # rounds: their number is a digit of every seed
-TRUTH, PREDICT = "truth", "predict"  # groups of sessions beside the rounds
+TRUTH, PREDICT, LIDAR = "truth", "predict", "hdl32e"  # groups of sessions beside the rounds
 MAPPING = "mapping"
 
 
 class Session(NamedTuple):
     """One drive, fixed to the bit by what stands here and by the network and the map that are there by then."""
 
-    group: str  # "round 1" to "round n", "truth", "predict" or "mapping"
+    group: str  # "round 1" to "round n", "truth", "predict", "hdl32e" or "mapping"
     scenario: str
     tour: str
     seed: int
@@ -66,9 +66,15 @@ class Schedule(NamedTuple):
             sessions += [item._replace(again=again, seed=item.seed + 100 * again) for item in hardest]
         return sessions
 
+    def lidar(self) -> list[Session]:
+        """Return a tour a scenario with the last network and a lidar that taught it nothing; none in one round."""
+        sessions = self._all(LIDAR, 12, "network") if self.rounds > 1 else []
+        return [session for session in sessions if session.tour == self.tours[0]]
+
     def groups(self) -> list[list[Session]]:
         """Return all sessions but the mapping, in the order in which they are driven."""
-        return [*(self.round(number + 1) for number in range(self.rounds)), self.truth(), self.predict()]
+        rounds = (self.round(number + 1) for number in range(self.rounds))
+        return [*rounds, self.truth(), self.predict(), self.lidar()]
 
     def _all(
         self, group: str, number: int, labels: Labels, *, people: Literal["ignore", "predict"] = "ignore"
