@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from graph.check import check
 from graph.cli import main
 from operators.montecarlo.comparison import METHODS, Run, table
-from operators.montecarlo.localizers_command import add_arguments, driven_graph
+from operators.montecarlo.localizers_command import add_arguments, batches, driven_graph, same_graph
+from operators.montecarlo.map_file import GridMap
+from operators.montecarlo.picture import FOUND, WALL, map_picture
 from operators.montecarlo.report import write_report
 from operators.rounds.variants import written
 
@@ -65,8 +70,50 @@ def test_each_graph_of_the_experiment_has_no_mistakes(tmp_path: Path, method: st
     assert METHODS[method] in file.read_text()
 
 
+@pytest.mark.parametrize("labels", ["none", "truth"])
+def test_all_methods_listen_to_one_recording_side_by_side(tmp_path: Path, labels: str):
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    args = parser.parse_args(["-o", str(tmp_path)])
+    graph = same_graph(args, tmp_path / "tour.mcap", list(METHODS), labels)
+    for method, kind in METHODS.items():
+        assert graph["operators"][method]["run"] == kind
+        assert graph["operators"][method]["inputs"]["frame"] == f"triage_{method}/localization"
+        assert graph["operators"][f"triage_{method}"]["config"] == {"localizer": method}
+    assert ("segmenter" in graph["operators"]) == (labels == "truth")
+    assert "planner" not in graph["operators"]
+
+
+def test_the_hard_scenario_on_shared_recordings_comes_first_and_a_robot_drives_with_one_method():
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    todo = list(batches(parser.parse_args(["-o", "out"]), ["none", "truth"]))
+    assert todo[0] == [("same", "hard", "A", method, "none") for method in METHODS]
+    driven = [jobs for jobs in todo if jobs[0][0] == "driven"]
+    assert {len(jobs) for jobs in driven} == {1}
+    assert len(driven) == 2 * 3 * 2 * len(METHODS)
+    assert len({job for jobs in todo for job in jobs}) == 2 * len(driven)
+
+
+def test_a_map_is_drawn_over_the_walls_upright():
+    cells = np.full((60, 80), -1, np.int8)
+    cells[30:50, 30:60] = 0
+    cells[49, 30:60] = 100  # the wall of the largest y
+    walls = GridMap(np.zeros((30, 30), np.int8), np.array([31.5, 31.5]) * 0.05, 0.05)
+    walls.cells[0, 0] = 100
+    picture = Image.open(io.BytesIO(map_picture(GridMap(cells, np.zeros(2), 0.05), walls))).convert("RGB")
+    shown = np.asarray(picture)
+    rows, columns = np.nonzero((shown == FOUND).all(axis=2))
+    assert len(set(rows.tolist())) == 1
+    assert len(columns) == 30
+    assert (shown == WALL).all(axis=2).sum() == 1
+    assert rows[0] < np.nonzero((shown == WALL).all(axis=2))[0][0]
+
+
 def test_what_is_missing_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["localizers", "-o", str(tmp_path), "--labels", "network"]) == 2
     assert "the network's labels want its weights" in capsys.readouterr().err
     assert main(["localizers", "-o", str(tmp_path), "--map", "nowhere.yaml"]) == 2
     assert "nowhere.yaml: no such file" in capsys.readouterr().err
+    assert main(["localizers", "-o", str(tmp_path), "--recordings", str(tmp_path / "none")]) == 2
+    assert "none: no such folder" in capsys.readouterr().err

@@ -15,6 +15,10 @@ TITLES = {
     "driven": "Each localizer in the loop: the robot drives with it",
     "same": "The same recordings for all: replayed with another localizer",
 }
+MAPS_TEXT = (
+    "<p>Black: occupied by the best particle at the tour's end. Red: the walls as they are, where it has nothing "
+    "occupied. A loop that was not closed shows as a wall drawn twice.</p>"
+)
 COLOURS = {"none": "#b0413e", "network": "#3b6ea5", "truth": "#5b8c5a"}
 WORDS = {"none": "whole cloud", "network": "network's labels", "truth": "true labels"}
 
@@ -28,7 +32,8 @@ def write_report(folder: Path, runs: list[Run], settings: dict[str, Any]) -> Non
     parts = [
         "<!doctype html><meta charset='utf-8'><title>Localizers</title>",
         "<style>body{font:15px sans-serif;max-width:70em;margin:2em auto}",
-        "td,th{padding:.2em .8em;text-align:right}</style>",
+        "td,th{padding:.2em .8em;text-align:right}",
+        ".maps{display:flex;flex-wrap:wrap}figure{margin:0 1em 1em 0}</style>",
         "<h1>Localizers with and without labels</h1>",
         "<p>Error: distance in the plane between estimated and true pose at 10 Hz. Factor: mean error of the whole "
         "cloud over that with labels. Paper: hard scenario, with the network's labels.</p>",
@@ -36,8 +41,25 @@ def write_report(folder: Path, runs: list[Run], settings: dict[str, Any]) -> Non
     for name, lines in tables.items():
         picture = base64.b64encode(box_plot(runs, name)).decode()
         parts += [f"<h2>{TITLES[name]}</h2>", f"<img src='data:image/png;base64,{picture}'>", rows(lines)]
+    if pictures := maps(folder, runs):
+        parts += ["<h2>What Gmapping drew</h2>", MAPS_TEXT, pictures]
     parts.append(f"<pre>{html.escape(json.dumps(settings, indent=1))}</pre>")
     (folder / "report.html").write_text("\n".join(parts) + "\n", encoding="utf-8")
+
+
+def maps(folder: Path, runs: list[Run]) -> str:
+    """Lay out the maps that were drawn, tours/<table>-<scenario>-<tour>-<method>-<labels>.png in a folder."""
+    figures = []
+    for run in runs:
+        file = folder / "tours" / f"{'-'.join(run[:5])}.png"
+        if file.exists():
+            caption = f"{run.scenario} {run.tour}, {WORDS[run.labels]}{', driven' * (run.table == 'driven')}"
+            picture = base64.b64encode(file.read_bytes()).decode()
+            figures.append(
+                f"<figure><img width='420' src='data:image/png;base64,{picture}'>"
+                f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+            )
+    return f"<div class='maps'>{''.join(figures)}</div>" if figures else ""
 
 
 def rows(lines: list[dict[str, Any]]) -> str:
