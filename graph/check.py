@@ -15,7 +15,7 @@ from graph.codec import schema, type_name
 from graph.contract import Operator, Ports, Sink, Source, method_hints, ports_of
 from graph.durations import duration_text
 from graph.errors import UserError
-from graph.graphfile import TIMER, Draft, Edge, Graph, GraphError, Mistake
+from graph.graphfile import TIMER, Draft, Edge, Graph, GraphError, Mistake, Record
 from graph.loading import ConfigError, build_config, load_class
 from graph.messages import Tick
 from graph.suggest import suggestion
@@ -64,6 +64,10 @@ def optional_inputs(kind: type[Operator]) -> frozenset[str]:
 def same_type(given: type[msgspec.Struct], wanted: type[msgspec.Struct]) -> bool:
     """Say whether messages of one type can be read as the other: one class, or one name and schema."""
     return given is wanted or (type_name(given) == type_name(wanted) and schema(given) == schema(wanted))
+
+
+def _digests(record: Record) -> bool:
+    return "digest" in (record.values() if isinstance(record, dict) else [record])
 
 
 class _Review:
@@ -115,6 +119,9 @@ class _Review:
         if entry.restart == "on-failure" and graph.clock.mode == "lockstep":
             text = f"{name}: restart: on-failure acts in realtime only; in lockstep a failure ends the run"
             self.warnings.append(self.draft.mistake(("operators", name, "restart"), text))
+        elif entry.restart == "on-failure" and _digests(entry.record):
+            text = f"{name}: record: digest with restart: on-failure: what a failing call had said cannot be replayed"
+            self.warnings.append(self.draft.mistake(("operators", name, "record"), text))
 
     def _look_at_ports(self, graph: Graph, name: str, kind: type[Operator]) -> None:
         ports, here = ports_of(kind), ("operators", name, "inputs")

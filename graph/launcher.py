@@ -18,6 +18,7 @@ from typing import IO, Any
 
 import msgspec
 
+from graph.errors import UserError
 from graph.graphfile import Graph
 from graph.inbox import Bell, Sample
 from graph.lockstep import endless
@@ -125,7 +126,10 @@ class Launcher:
         self.paths = Paths.choose(graph.name, record)
         self.run = describe(graph, self.specs, command)
         self.prefix = f"retracer/{secrets.token_hex(4)}"
-        self.endpoint = f"tcp/{host}:{free_port(host)}"
+        try:
+            self.endpoint = f"tcp/{host}:{free_port(host)}"
+        except OSError as error:
+            raise UserError(f"nobody can listen on {host}: {error.strerror}") from error
         self.log_level = log_level
         self.status = StatusLine([spec.name for spec in self.specs], quiet=quiet)
         self.children: dict[str, Child] = {}

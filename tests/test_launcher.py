@@ -315,6 +315,7 @@ def test_live_operators_run_with_recorded_ones(graph_file: Write, tmp_path: Path
         (["launch", "{graph}", "--from", "x.mcap", "--sources", "counter"], "x.mcap: no such recording"),
         (["launch", "{graph}", "--record", "{tmp}/run.txt"], "a recording is an .mcap file"),
         (["launch", "{graph}", "--record", "{graph}/run.mcap"], "no recording can be written to"),
+        (["launch", "{graph}", "--host", "300.1.1.1"], "nobody can listen on 300.1.1.1: "),
         (["launch", "{graph}", "--set", "counter.lst=3"], "did you mean 'last'"),
         (["launch", "{graph}", "--swap", "relay=tests.sample_operators:Relai"], "did you mean 'Relay'"),
         (["replay", "{graph}"], "is not an MCAP file"),
