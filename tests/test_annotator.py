@@ -83,6 +83,7 @@ def test_without_a_map_everything_is_new_and_still_labelled():
     _, labelled, summary = drive(Annotator(Annotator.Config(every=10, frustum_width=0.0122)), steps=24)
     assert len(labelled) == 3
     assert summary["points"]["permanent"] == 0
+    assert summary["points"]["ground"] > 0.1 * sum(summary["points"].values())
     assert summary["points"]["longT"] > 0.2 * sum(summary["points"].values())
 
 

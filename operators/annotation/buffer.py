@@ -159,8 +159,9 @@ def classify(known: KnownMap, new: MapPoints, settings: Classing | None = None) 
     else:
         touched = extend_by_ring(known.voxels, new, labels, settings)
         known_labels = np.where(touched & (known_labels == PERMANENT), UNCERTAIN, known_labels).astype(np.uint8)
-    if known.plane is not None:
-        floor = np.abs(height_above(known.plane, new.points)) < settings.ground
+    plane = find_ground(new.points, new.normals) if known.plane is None else known.plane
+    if plane is not None:
+        floor = np.abs(height_above(plane, new.points)) < settings.ground
         labels[floor] = GROUND
     return Buffer(known, known_labels, new._replace(label=labels), settings.apart)
 
