@@ -114,7 +114,7 @@ def frame_rows(lidar: str, preset: str = "realtime") -> list[dict[str, Any]]:
 
 
 def core_row(preset: str = "realtime") -> dict[str, Any]:
-    """Measure the processor time of a frame on one thread, as graph.yaml has it: the robot's other operators want some."""
+    """Measure the processor time of a frame on one thread, as graph.yaml has it."""
     seen, base_from_lidar = frames(2 * REPEATS, "paper")
     torch.set_num_threads(1)
     classifier = classifier_of(recipe_of(PRESETS[preset]).network().eval(), PRESETS[preset])
