@@ -19,7 +19,7 @@ from graph.geometry import planar, yaw
 from graph.messages import OccupancyGrid, Odometry, PointCloud, Pose
 from operators.montecarlo.amcl import Amcl as Filter
 from operators.montecarlo.amcl import Parameters
-from operators.montecarlo.map_file import OCCUPIED, GridMap, load_map
+from operators.montecarlo.map_file import OCCUPIED, GridMap, MapError, load_map
 from operators.montecarlo.scan import Scan2D
 from operators.pointmap.rehearsal import room_scan
 from operators.pointmap.trail import Trail
@@ -97,7 +97,11 @@ class Amcl(Planar):
         """Load the map. Raises MapError, a ValueError, in one sentence for a map or settings that will not do."""
         super().__init__(config)
         c: Amcl.Config = self.config
-        self.begin(load_map(c.map))
+        grid = load_map(c.map)
+        try:
+            self.begin(grid)
+        except MapError as error:
+            raise MapError(f"{c.map}: {error}") from None
 
     def begin(self, grid: GridMap) -> None:
         """Take a map."""

@@ -104,6 +104,9 @@ def test_a_map_that_is_not_there_or_will_not_do_is_told_by_name(map_file, tmp_pa
     map_file.write_text(map_file.read_text().replace("0.05", "-1"))
     with pytest.raises(MapError, match="it is -1"):
         Amcl(Amcl.Config(map=map_file))
+    save_map(map_file, room_map()._replace(cells=np.zeros((9, 9), np.int8)))
+    with pytest.raises(MapError, match=r"room\.yaml: the map has no occupied cell"):
+        Amcl(Amcl.Config(map=map_file))
 
 
 def test_a_flattened_cloud_is_localized_as_the_whole_is():

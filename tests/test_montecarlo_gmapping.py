@@ -172,6 +172,9 @@ def test_a_room_is_mapped_where_it_is():
     near = [known.cells[max(0, y - 2) : y + 3, max(0, x - 2) : x + 3].max() == 100 for x, y in cells]
     assert np.mean(near) > 0.98
     assert (grid.cells == 0).sum() > 8000
+    for side in (grid.cells[:SIDE], grid.cells[-SIDE:], grid.cells[:, :SIDE], grid.cells[:, -SIDE:]):
+        assert (side >= 0).any()  # it ends where nothing more was seen
+    assert Gmapping(Settings(particles=2)).grid().cells.size == 0
 
 
 def test_the_same_seed_says_the_same_bits_also_after_resampling():

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from graph.geometry import wrap
 from operators.montecarlo.likelihood import free_places, likelihood_field, weigh
-from operators.montecarlo.map_file import GridMap
+from operators.montecarlo.map_file import GridMap, MapError
 from operators.montecarlo.motion import Alphas, compose, difference, move
 from operators.montecarlo.resampling import heaviest_cluster, mean_pose, resample
 from operators.montecarlo.scan import Band
@@ -88,6 +88,7 @@ class Amcl:
             )
         self.places = free_places(grid)
         self.cell = grid.resolution
+        self.low, self.high = grid.origin, grid.origin + grid.resolution * np.array(grid.cells.shape[::-1])
         self.field = likelihood_field(
             grid,
             z_hit=p.laser_z_hit,
@@ -107,8 +108,14 @@ class Amcl:
             self.put(start)
 
     def put(self, pose: tuple[float, float, float]) -> None:
-        """Say where the robot is, with the initial covariance."""
+        """Say where the robot is, with the initial covariance. Raises MapError for a place beyond the map."""
         p = self.parameters
+        if not ((self.low <= pose[:2]) & (pose[:2] <= self.high)).all():
+            raise MapError(
+                f"the robot begins at ({pose[0]:g}, {pose[1]:g}), which is beyond the map: x from {self.low[0]:g} to "
+                f"{self.high[0]:g} and y from {self.low[1]:g} to {self.high[1]:g} m; are its origin, its resolution "
+                f"({self.cell:g} m) and the pose right?"
+            )
         scales = np.sqrt([p.initial_cov_xx, p.initial_cov_yy, p.initial_cov_aa])
         poses = np.array(pose) + self.rng.standard_normal((p.max_particles, 3)) * scales
         poses[:, 2] = wrap(poses[:, 2])

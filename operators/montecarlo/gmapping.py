@@ -16,7 +16,7 @@ from graph.geometry import wrap
 from operators.montecarlo.map_file import FREE, OCCUPIED, UNKNOWN, GridMap
 from operators.montecarlo.matching import MOST_KERNEL, match
 from operators.montecarlo.motion import Spread, compose, difference, shake
-from operators.montecarlo.patches import Patches
+from operators.montecarlo.patches import SIDE, Patches
 from operators.montecarlo.resampling import effective, systematic
 from operators.montecarlo.scan import Band
 
@@ -148,7 +148,13 @@ class Gmapping:
         self.scans += 1
 
     def grid(self, index: int | None = None) -> GridMap:
-        """Return the map of a particle, by default of the best: 100 where enough beams ended, 0 where they passed."""
-        hits, visits = self.patches.dense(self.best if index is None else index)
+        """Return the map of a particle, by default of the best: 100 where enough beams ended, 0 where they passed.
+
+        It reaches as far as the particle has seen, and has no cells before the first scan.
+        """
+        particle, patches = self.best if index is None else index, self.patches
+        rows, columns = patches.seen(particle)
+        hits, visits = patches.dense(particle, rows, columns)
         seen = np.where(hits > self.settings.occ_thresh * visits, OCCUPIED, FREE)
-        return GridMap(np.where(visits > 0, seen, UNKNOWN).astype(np.int8), self.patches.origin, self.settings.delta)
+        corner = patches.origin + SIDE * self.settings.delta * np.array([columns.start, rows.start])
+        return GridMap(np.where(visits > 0, seen, UNKNOWN).astype(np.int8), corner, self.settings.delta)

@@ -36,11 +36,17 @@ def likelihood_field(
 ) -> LikelihoodField:
     """Compute (z_hit exp(-d^2 / (2 sigma_hit^2)) + z_rand / range_max)^3 of each cell, d metres from something.
 
-    Distances end at max_dist. Raises MapError for a map in which nothing is occupied, or whose cells are too fine.
+    Distances end at max_dist. Raises MapError for a map in which nothing is occupied, or whose cells are too
+    fine or too coarse.
     """
     occupied = grid.cells > 100 * OCCUPIED_THRESHOLD
     if not occupied.any():
         raise MapError("the map has no occupied cell, so nothing can be told from a scan")
+    if grid.resolution > max_dist:
+        raise MapError(
+            f"the map has cells of {grid.resolution:g} m, which is more than laser_likelihood_max_dist, "
+            f"{max_dist:g} m; a map for scans has cells of some centimetres"
+        )
     if max_dist / grid.resolution > MOST_CELLS - 2:
         raise MapError(
             f"the map has cells of {grid.resolution:g} m; laser_likelihood_max_dist, {max_dist:g} m, "

@@ -19,6 +19,7 @@ SIDE = 1 << BITS  # cells along a patch
 FULL = 0.1  # share of hits from which a cell counts as occupied when scans are matched
 HITS, X, Y = 0, 1, 2  # of a cell: end points in it, and the means of their offsets (metres)
 LAST = SIDE - 1
+WHOLE = slice(None)
 
 
 class Store(NamedTuple):
@@ -91,41 +92,47 @@ class Patches:
     def enter(self, index: int, sensor: Doubles, ends: Doubles, hits: Flags) -> None:
         """Enter a scan into a map: beams from sensor (2,) to ends (n, 2) in the world, which hit something or not."""
         if len(ends):
-            self.reserve(self._room(np.concatenate([ends, sensor[None]])))
+            self.reserve(self._room(*np.concatenate([ends, sensor[None]]).T))
             _enter(self.directory[index], self.store, sensor - self.origin, ends - self.origin, hits, self.resolution)
 
     def enter_each(self, poses: Doubles, sensor: Doubles, ends: Doubles, hits: Flags) -> None:
         """Enter a scan into each map at its own pose (maps, 3); sensor (2,) and ends (n, 2) are in the base frame."""
         if not len(ends):
             return
-        reach = math.sqrt(max((ends**2).sum(axis=1).max(), (sensor**2).sum()))
-        places = poses[:, :2]
-        self.cover(places.min(axis=0) - reach, places.max(axis=0) + reach)
-        wanted = int(2.0 * reach / (SIDE * self.resolution) + 2.0) ** 2
+        x, y = np.concatenate([ends, sensor[None]]).T
+        cosine, sine = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
+        wanted = self._room(poses[:, :1] + cosine * x - sine * y, poses[:, 1:2] + sine * x + cosine * y)
+        local, size = poses - np.append(self.origin, 0.0), self.resolution
         entered = 0
         while entered < len(poses):
             self.reserve(wanted)
-            corner = np.append(self.origin, 0.0)
-            local = poses - corner
-            entered = _enter_each(
-                self.directory, self.store, local, sensor, ends, hits, self.resolution, entered, wanted
-            )
+            entered = _enter_each(self.directory, self.store, local, sensor, ends, hits, size, entered, wanted)
 
-    def _room(self, points: Doubles) -> int:
-        """Let all maps reach over points (n, 2); returns how many patches these may touch at most."""
-        low, high = points.min(axis=0), points.max(axis=0)
-        self.cover(low, high)
-        spread = np.floor((high - low) / (SIDE * self.resolution)) + 2
+    def _room(self, x: Doubles, y: Doubles) -> int:
+        """Let all maps reach over points, and a cell more; returns how many patches one map may touch at most."""
+        low, high = (np.array([bound(x), bound(y)]) for bound in (np.min, np.max))
+        self.cover(low - self.resolution, high + self.resolution)
+        spread = np.floor((high - low) / (SIDE * self.resolution)) + 3
         return int(spread[0] * spread[1])
 
-    def dense(self, index: int) -> tuple[Floats, Floats]:
-        """Return how many beams ended in each cell of one map and how many met it, each (rows, columns)."""
-        _, rows, columns = self.directory.shape
-        places = self.directory[index]
+    def seen(self, index: int) -> tuple[slice, slice]:
+        """Return the rows and columns, in patches, within which one map holds anything."""
+        held = self.directory[index] != 0
+        if not held.any():
+            return slice(0, 0), slice(0, 0)
+        rows, columns = (np.nonzero(held.any(axis=axis))[0] for axis in (1, 0))
+        return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+    def dense(self, index: int, rows: slice = WHOLE, columns: slice = WHOLE) -> tuple[Floats, Floats]:
+        """Return how many beams ended in each cell of one map and how many met it, each (rows, columns).
+
+        rows, columns: of patches, for a part of the map.
+        """
+        places = self.directory[index, rows, columns]
         both = []
         for values in (self.store.ends[places, :, HITS], (self.store.visits[places] >> 1).astype(np.float32)):
-            tiles = values.reshape(rows, columns, SIDE, SIDE).transpose(0, 2, 1, 3)
-            both.append(np.ascontiguousarray(tiles).reshape(rows * SIDE, columns * SIDE))
+            tiles = values.reshape(*places.shape, SIDE, SIDE).transpose(0, 2, 1, 3)
+            both.append(np.ascontiguousarray(tiles).reshape(places.shape[0] * SIDE, places.shape[1] * SIDE))
         return both[0], both[1]
 
     def in_use(self) -> int:
