@@ -40,7 +40,8 @@ def operators_of(package: str) -> Iterator[tuple[str, type[Operator] | UserError
             yield name, error
             continue
         for kind in vars(module).values():
-            if inspect.isclass(kind) and issubclass(kind, Operator) and kind.__module__ == name:
+            own = inspect.isclass(kind) and issubclass(kind, Operator) and kind.__module__ == name
+            if own and "warm_up" in vars(kind):
                 yield f"{name}:{kind.__qualname__}", kind
 
 
