@@ -236,8 +236,10 @@ def test_a_map_without_free_or_without_occupied_cells_is_refused():
     assert len(free_places(room())) == (room().cells == 0).sum()
     with pytest.raises(MapError, match="cells of 5 m, which is more than laser_likelihood_max_dist"):
         Amcl(room()._replace(resolution=5.0))
-    with pytest.raises(MapError, match=r"begins at \(3, 2.5\), which is beyond the map: x from -0.5 to 0.6 "):
-        Amcl(room()._replace(resolution=0.005), start=(3.0, 2.5, 0.0))
+    with pytest.raises(
+        MapError, match=r"begins at \(3, 2.5\), which is beyond the map: x from -0.5 to 3.9 and y from -0.5 to 2.3"
+    ):
+        Amcl(room()._replace(resolution=0.02), start=(3.0, 2.5, 0.0))
 
 
 def test_a_building_becomes_a_map_of_its_walls(tmp_path: Path):
