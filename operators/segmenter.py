@@ -15,8 +15,10 @@ import msgspec
 import numpy as np
 
 from graph.contract import Operator, Summary
+from graph.geometry import planar
 from graph.messages import PointCloud
 from operators.kpconv.metrics import LABEL_OF_TRUTH
+from operators.pointmap.rehearsal import room_scan
 from operators.pointmap.voxels import central_points
 
 if TYPE_CHECKING:
@@ -70,6 +72,17 @@ class Segmenter(Counted):
 
         precisions = {"auto": None, "float32": torch.float32, "bfloat16": torch.bfloat16}
         self.classifier: Classifier = load_classifier(config.weights, precisions[config.precision])
+
+    @classmethod
+    def warm_up(cls) -> None:
+        """Classify a scan of a made-up room by an untrained network."""
+        from operators.kpconv.classifier import classifier_of
+        from operators.kpconv.settings import PRESETS
+        from operators.kpconv.weights import recipe_of
+
+        settings = PRESETS["realtime"]
+        classifier = classifier_of(recipe_of(settings).network().eval(), settings)
+        classifier.classify(room_scan(), planar(0.0, 0.0, 0.0, 0.64), full=True)
 
     def on_frame(self, frame: PointCloud) -> Counted.Outputs:
         """Subsample and classify a frame."""
