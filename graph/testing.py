@@ -18,6 +18,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from xxhash import xxh3_128
 
 from graph.codec import decode, encode
 from graph.contract import Operator, kind_of, ports_of
@@ -82,10 +83,17 @@ def run_operator(
 
 
 def reference(recording: Recording) -> str:
-    """Say in words what a recording says: calls, messages, and the rounded mean of every number, topic by topic."""
+    """Say in words what a recording says: calls, messages, and the rounded mean of every number, topic by topic.
+
+    Of topics that are kept as digests it gives a checksum over the bytes of all their messages.
+    """
     steps: dict[str, int] = {}
     counts: dict[str, int] = {}
     sums: dict[str, list[float]] = {}
+    kept = {
+        f"{spec.name}/{port}" for spec in recording.run.specs for port in spec.outputs if spec.record[port] == "full"
+    }
+    checksums: dict[str, xxh3_128] = {}
     types = {
         f"{name}/{port}": kind
         for name, entry in recording.graph.operators.items()
@@ -96,6 +104,8 @@ def reference(recording: Recording) -> str:
         for item in step.emitted:
             topic = f"{operator}/{item.port}"
             counts[topic] = counts.get(topic, 0) + 1
+            if ports[topic] == "digest":
+                checksums.setdefault(topic, xxh3_128()).update(item.digest)
     for entry in recording.messages():
         message = decode(entry.payload, types[entry.topic])
         for field in message.__struct_fields__:
@@ -104,7 +114,10 @@ def reference(recording: Recording) -> str:
     sinks = {spec.name for spec in recording.run.specs if spec.kind == "sink"}
     text = [f"{recording.verdict.verdict} after {recording.verdict.end / 1e9:g} s"]
     text += [f"{name}: {count} steps" for name, count in steps.items() if name not in sinks]
-    text += [f"{topic}: {count} messages" for topic, count in counts.items()]
+    text += [
+        f"{topic}: {count} messages" + (f", checksum {checksums[topic].hexdigest()[:16]}" if topic in checksums else "")
+        for topic, count in counts.items()
+    ]
     text += [f"{field}: mean {np.mean(values):.{DIGITS}g}" for field, values in sorted(sums.items())]
     text += [f"{name} summary: {_rounded(summary)}" for name, summary in sorted(recording.summaries().items())]
     return "\n".join(text) + "\n"
