@@ -90,9 +90,7 @@ def reference(recording: Recording) -> str:
     steps: dict[str, int] = {}
     counts: dict[str, int] = {}
     sums: dict[str, list[float]] = {}
-    kept = {
-        f"{spec.name}/{port}" for spec in recording.run.specs for port in spec.outputs if spec.record[port] == "full"
-    }
+    ports = {f"{spec.name}/{port}": spec.record[port] for spec in recording.run.specs for port in spec.outputs}
     checksums: dict[str, xxh3_128] = {}
     types = {
         f"{name}/{port}": kind
