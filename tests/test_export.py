@@ -15,7 +15,7 @@ from graph.codec import decode
 from graph.geometry import planar
 from graph.messages import Odometry, PointCloud
 from graph.recording import Recording
-from operators.scans.export_command import Translator
+from operators.scans.export_command import Bag, Translator
 
 GRAPH = """
 clock: {mode: lockstep, duration: 500ms}
@@ -94,6 +94,19 @@ def test_a_topic_that_is_not_there_is_named(
     out = tmp_path / "run.mcap"
     assert main(["export", str(recording.path), "-o", str(out), "--topics", "localizer/pos"]) == 2
     assert "names localizer/pos; " in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_said_and_leaves_nothing_behind(
+    recording: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Bag, "write", full)
+    out = tmp_path / "run.mcap"
+    assert main(["export", str(recording.path), "-o", str(out)]) == 2
+    assert f"{out}: No space left on device; nothing was kept" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

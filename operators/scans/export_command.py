@@ -211,6 +211,8 @@ def run(args: argparse.Namespace) -> int:
                 progress(done / max(1, total))
             bag.writer.finish()  # type: ignore[no-untyped-call]
         part.replace(args.output)
+    except OSError as error:
+        raise UserError(f"{args.output}: {error.strerror or error}; nothing was kept") from None
     finally:
         part.unlink(missing_ok=True)
     if args.json:
