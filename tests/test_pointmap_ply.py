@@ -6,9 +6,11 @@ import re
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from operators.pointmap import MapPoints, PlyError, load_map, save_map
 from operators.pointmap.ply import read_ply, write_ply
+from operators.pointmap.thinning import thinned
 
 
 def example(count=50, **more):
@@ -140,3 +142,35 @@ def test_columns_of_two_lengths_are_no_table(tmp_path):
 def test_columns_of_any_kind_are_kept(tmp_path):
     write_ply(tmp_path / "x.ply", {"x": np.arange(3, dtype=np.float32), "class": np.arange(3, dtype=np.uint8)})
     assert read_ply(tmp_path / "x.ply")["class"].tolist() == [0, 1, 2]
+
+
+def test_a_packed_map_comes_back_to_the_bit(tmp_path):
+    cloud = example()
+    save_map(tmp_path / "map.ply.gz", cloud)
+    again = load_map(tmp_path / "map.ply.gz")
+    assert all(np.array_equal(a, b) for a, b in zip(cloud[:3], again[:3], strict=True))
+    packed = (tmp_path / "map.ply.gz").read_bytes()
+    (tmp_path / "cut.ply.gz").write_bytes(packed[: len(packed) // 2])
+    with pytest.raises(PlyError, match="cut.ply.gz is packed by gzip, and damaged"):
+        load_map(tmp_path / "cut.ply.gz")
+
+
+def test_a_thinned_map_keeps_a_point_wherever_there_was_one(tmp_path):
+    random = np.random.default_rng(1)
+    points = random.uniform(0, 3, (20_000, 3)).astype(np.float32)
+    normals = np.zeros((20_000, 3), np.float32)
+    normals[:10_000, 0] = normals[10_000:, 2] = 1.0  # half of it level
+    points[10_000:, 2] = 0.0
+    cloud = MapPoints(points, normals, np.full(20_000, 0.7, np.float32), label=np.arange(20_000).astype(np.uint8))
+    few = thinned(cloud, 0.2)
+    assert len(few.points) < 0.25 * len(points)
+    for part, kept, size in (
+        (points[:10_000], few.normals[:, 0] > 0, 0.2),
+        (points[10_000:], few.normals[:, 2] > 0, 0.5),
+    ):
+        distance, _ = cKDTree(few.points[kept]).query(part)
+        assert distance.max() < np.sqrt(3) * size + 0.01
+        assert len(np.unique(np.floor(part / size), axis=0)) == kept.sum()
+    own, row = cKDTree(points).query(few.points)
+    assert own.max() < 0.002
+    assert np.array_equal(few.label, cloud.label[row])

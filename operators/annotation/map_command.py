@@ -16,7 +16,8 @@ import numpy as np
 from graph.errors import UserError
 from graph.status import progress_bar
 from operators.annotation.first_map import FirstMap, first_map
-from operators.pointmap import Settings, save_map
+from operators.pointmap import PlyError, Settings, load_map, save_map
+from operators.pointmap.thinning import thinned
 from operators.pointray import RaySettings
 from operators.recorded_session import RecordedSession
 
@@ -26,21 +27,26 @@ MOST_INVALID = 0.1  # share of the frames; a map of more is no map
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `retracer map`."""
-    parser.add_argument("session", type=Path, metavar="SESSION", help="a recording of a tour of the whole building")
+    parser.add_argument(
+        "session", type=Path, metavar="SESSION", help="a recording of a tour of the whole building; or a map, to thin"
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="MAP.ply")
     parser.add_argument("--frames", metavar="TOPIC", help="the point clouds; default: those of the lidar")
     parser.add_argument("--voxel", type=float, default=0.03, metavar="M", help="one point of the map a voxel")
     parser.add_argument("--threshold", type=float, default=0.7, help="movable probability beyond which points go")
     parser.add_argument("--vertical-resolution", type=float, default=1.33, metavar="DEG", help="of the lidar")
     parser.add_argument("--frustum-width", type=float, default=0.15, metavar="DEG", help="of the ray tracing")
+    parser.add_argument("--thin", type=float, metavar="M", help="keep one point of so wide a voxel, for a small file")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.add_argument("--json", action="store_true", help="print the outcome as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Map a session. Raises UserError in one sentence; then no map is written."""
-    if args.output.suffix.lower() != ".ply":
-        raise UserError(f"a map is a .ply file; {args.output} is none")
+    if not is_map(args.output):
+        raise UserError(f"a map is a .ply or .ply.gz file; {args.output} is none")
+    if args.thin is not None and not args.voxel <= args.thin <= 1.0:
+        raise UserError(f"--thin wants metres from --voxel to 1; it was given {args.thin:g}")
     if not 0.0 < args.voxel <= 1.0:
         raise UserError(f"--voxel wants metres above 0, up to 1; it was given {args.voxel:g}")
     for name, least in (("vertical-resolution", 0.1), ("frustum-width", 0.02)):
@@ -50,7 +56,11 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--threshold is a probability; it was given {args.threshold:g}")
     if not args.output.parent.is_dir():
         raise UserError(f"{args.output} cannot be written: there is no folder {args.output.parent}")
+    if is_map(args.session):
+        return thin(args)
     made, seconds = map_session(args)
+    if args.thin is not None:
+        made = made._replace(cloud=thinned(made.cloud, args.thin))
     try:
         save_map(args.output, made.cloud)
     except OSError as error:
@@ -67,6 +77,26 @@ def run(args: argparse.Namespace) -> int:
         "seconds": seconds,
     }
     print(json.dumps(told, indent=2) if args.json else text(told))
+    return 0
+
+
+def is_map(path: Path) -> bool:
+    """Say whether a path is named as a map."""
+    return path.name.lower().endswith((".ply", ".ply.gz"))
+
+
+def thin(args: argparse.Namespace) -> int:
+    """Make a smaller map of a map. Raises UserError where it cannot be read or written."""
+    if args.thin is None:
+        raise UserError(f"{args.session} is a map already; --thin 0.1 makes a smaller one of it")
+    try:
+        whole = load_map(args.session)
+        few = thinned(whole, args.thin)
+        save_map(args.output, few)
+    except (PlyError, OSError) as error:
+        raise UserError(str(error)) from None
+    told = {"map": str(args.output), "points": len(few.points), "of": len(whole.points)}
+    print(json.dumps(told, indent=2) if args.json else f"{args.output}: {told['points']} of {told['of']} points")
     return 0
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gzip
 import os
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ TYPES = {
 }  # fmt: skip
 NAMES = {"f4": "float", "u1": "uchar"}
 FORMATS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+PACKED, MAGIC = ".gz", b"\x1f\x8b"
 COORDINATES, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
 
 
@@ -30,7 +33,7 @@ class PlyError(ValueError):
 def write_ply(path: Path, columns: Columns) -> None:
     """Write columns of one length (float32 or uint8) as the vertices of a binary little-endian PLY.
 
-    The file appears whole or not at all. Raises OSError when it cannot be written.
+    A path that ends with .gz is packed. The file appears whole or not at all. Raises OSError when it cannot be written.
     """
     lengths = {len(column) for column in columns.values()}
     if len(lengths) != 1:
@@ -41,11 +44,11 @@ def write_ply(path: Path, columns: Columns) -> None:
         table[name] = column
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
     lines += [f"property {NAMES[kind]} {name}" for name, kind in kinds]
+    raw = "\n".join([*lines, "end_header\n"]).encode("ascii") + table.tobytes()
     partial = path.with_name(f"{path.name}.part")
     try:
         with partial.open("wb") as file:
-            file.write("\n".join([*lines, "end_header\n"]).encode("ascii"))
-            file.write(table.tobytes())
+            file.write(gzip.compress(raw, mtime=0) if path.suffix == PACKED else raw)
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
@@ -55,8 +58,16 @@ def write_ply(path: Path, columns: Columns) -> None:
 
 
 def read_ply(path: Path) -> Columns:
-    """Read the vertices of a PLY, ASCII or binary, as columns by name. Raises PlyError, or OSError without the file."""
+    """Read the vertices of a PLY, ASCII or binary, packed by gzip or not, as columns by name.
+
+    Raises PlyError, or OSError without the file.
+    """
     raw = path.read_bytes()
+    if raw.startswith(MAGIC):
+        try:
+            raw = gzip.decompress(raw)
+        except (OSError, EOFError, zlib.error) as error:
+            raise PlyError(f"{path} is packed by gzip, and damaged: {error}") from None
     head, mark, body = raw.partition(b"end_header")
     if not raw.startswith(b"ply") or not mark:
         raise PlyError(f"{path} is not a PLY file: it has no header from 'ply' to 'end_header'")
