@@ -21,6 +21,7 @@ from graph.messages import Drive, Goal, OccupancyGrid, Plan, PointCloud, Pose, T
 from operators.navigation.footprint import Footprint
 from operators.navigation.navigator import Navigator
 from operators.navigation.people import NOBODY, Walkers
+from operators.navigation.presence import BLIND, Presence
 from operators.navigation.window import Limits
 from operators.pointmap.rehearsal import room_scan
 
@@ -71,6 +72,7 @@ class Planner(Operator):
         self._poses: deque[tuple[int, Matrix]] = deque(maxlen=HISTORY)
         self._frames: deque[PointCloud] = deque(maxlen=WAITING)
         self._tracks: Tracks | None = None
+        self._presence = Presence()
 
     @classmethod
     def warm_up(cls) -> None:
@@ -113,6 +115,9 @@ class Planner(Operator):
             where = self._pose_at(frame.measured_at)
             if where is not None:
                 self.navigator.observe(frame.points, where, frame.base_from_lidar)
+                if self.config.people == "predict":
+                    things = self.navigator.costmap.standing(float(where[0, 3]), float(where[1, 3]), BLIND)
+                    self._presence.observe(frame.points, where @ frame.base_from_lidar, things)
         if self.config.people == "predict":
             self.navigator.meet(self._walkers(pose.measured_at))
         decision = self.navigator.step(pose.measured_at, pose.world_from_base, valid=pose.valid)
@@ -131,7 +136,8 @@ class Planner(Operator):
             return NOBODY
         seconds = (time - self._tracks.measured_at) * 1e-9 + self.config.latency
         places = self._tracks.position + seconds * self._tracks.velocity
-        return np.concatenate([places, self._tracks.velocity], axis=1)
+        walkers = np.concatenate([places, self._tracks.velocity], axis=1)
+        return self._presence.company(self._tracks.identity, walkers, self._tracks.unseen)
 
     def _pose_at(self, time: int) -> Matrix | None:
         """Return world_from_base at a time within the history, between its neighbours; None before its first."""

@@ -13,7 +13,22 @@ from hypothesis import strategies as st
 from operators.navigation.footprint import Footprint, Surroundings
 from operators.navigation.lattice import Lattice
 from operators.navigation.motion import Twist, advance, towards
-from operators.navigation.people import BODY, EASY, NOBODY, STRIDE, WALK, nearby, person_room, toll
+from operators.navigation.people import (
+    BELIEVED,
+    BODY,
+    COMES,
+    COMING,
+    COMING_COST,
+    COMING_ROOM,
+    EASY,
+    NOBODY,
+    STRIDE,
+    WALK,
+    nearby,
+    person_room,
+    surcharge,
+    toll,
+)
 from operators.navigation.search import cost_to_go
 from operators.navigation.window import DynamicWindow, Limits, way_around
 
@@ -104,7 +119,33 @@ def test_nobody_who_stands_is_driven_into(ahead):
     assert least > -0.02
 
 
-def test_robot_all_but_stops_for_who_comes_towards_it():
-    coming = choose([[0.95, 0.0, -0.8, 0.0]])
-    assert coming.target.linear < 0.2
+@pytest.mark.parametrize("speed", [0.5, 0.8])
+@pytest.mark.parametrize("ahead", [0.8, 0.95])
+def test_robot_gives_way_to_who_comes_towards_it(ahead, speed):
+    choice = choose([[ahead, 0.0, -speed, 0.0]])
+    assert choice.target.linear < 0.0 or abs(choice.target.angular) > 0.3
     assert choose(NOBODY).target.linear > 1.0
+
+
+def test_robot_that_drives_brakes_for_who_comes_towards_it():
+    for ahead in (0.8, 1.0, 1.3):
+        assert choose([[ahead, 0.0, -0.8, 0.0]], now=Twist(0.6, 0.0)).target.linear <= 0.0
+
+
+@given(walkers, numbers, numbers, st.floats(0.0, 2.0), st.floats(-math.pi, math.pi), st.floats(-0.6, 1.3))
+@settings(max_examples=100, deadline=None)
+def test_surcharge_is_what_misses_at_the_closest(people, x, y, seconds, yaw, speed):
+    soon, met, sure = 0.0, 0.0, COMING_COST * max(0.0, 1.0 - seconds / BELIEVED)
+    for row in people:
+        pace = float(np.hypot(*row[2:]))
+        if pace < COMES:
+            continue
+        reach = BODY + STRIDE * min(1.0, pace / WALK) + RADIUS + COMING_ROOM
+        times = np.linspace(0.0, COMING, 801)[:, None]
+        away = row[:2] + seconds * row[2:] - (x, y)
+        away = np.hypot(*(away + times * (row[2:] - speed * np.array([math.cos(yaw), math.sin(yaw)]))).T)
+        met = max(met, reach - away[0])
+        soon = max(soon, reach - away.min() if away.argmin() > 0 else 0.0)
+    found = surcharge(people, RADIUS, seconds, x, y, yaw, speed)
+    assert found[1] == pytest.approx(sure * met, abs=1e-6)
+    assert max(found) == pytest.approx(sure * max(soon, met), abs=2e-2)

@@ -218,6 +218,16 @@ class Costmap:
         unknown &= ~self.obstacles.filled[rows, columns]
         return rows[unknown], columns[unknown]
 
+    def standing(self, x: float, y: float, radius: float) -> npt.NDArray[np.float64]:
+        """Return the centres (n, 2) of the occupied cells within `radius` metres of a position."""
+        row, column = self.lattice.cell(x, y)
+        reach = math.ceil(radius / CELL)
+        top, left = max(row - reach, 0), max(column - reach, 0)
+        part = slice(top, max(row + reach + 1, 0)), slice(left, max(column + reach + 1, 0))
+        rows, columns = np.nonzero((self.cells[part] >= OCCUPIED) | self.obstacles.filled[part])
+        places = np.stack(self.lattice.centre(rows + top, columns + left), axis=1)
+        return np.asarray(places[np.hypot(places[:, 0] - x, places[:, 1] - y) <= radius])
+
     def window(self, x: float, y: float, side: float, limit: float) -> Surroundings:
         """Return how near things are, up to `limit` metres, in a square of `side` metres around a position.
 

@@ -237,7 +237,7 @@ class Navigator:
         motions = self._recovery.motions
         while motions:
             twist, steps = motions.pop(0)
-            if steps > 0 and self.window.free_steps(pose, twist, around, 3) == 3:
+            if steps > 0 and self.window.free_steps(pose, twist, around, 3, walkers=self._walkers) == 3:
                 motions.insert(0, (twist, steps - 1))
                 return twist
         self._recovery = None

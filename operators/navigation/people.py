@@ -14,8 +14,8 @@ from numba import njit
 
 Walkers = npt.NDArray[np.float64]  # (k, 4): x, y in metres, velocity along x and y in m/s, now
 
-BODY = 0.25  # metres from the middle of a person to its side
-STRIDE = 0.15  # metres that feet swing ahead and behind besides, at a walk
+BODY = 0.22  # metres from the middle of a person to its side
+STRIDE = 0.22  # metres that feet swing ahead and behind besides, at a walk
 WALK = 0.6  # m/s at which they do so fully
 KEPT = 0.05  # metres kept free between a person and the robot's outline circle
 EASY = 0.50  # metres from which passing a person costs nothing
@@ -24,8 +24,13 @@ CERTAIN = 1.0  # seconds within which nobody is driven into, by what is known no
 PERSON_COST = 3.0  # seconds for each second's way at full speed with no room at all
 NEAR = 0.25  # metres: nearer, even a robot that stands is better elsewhere
 NEAR_COST = 3.0  # seconds a second with no room at all
-GENTLE, SPEED_PER_METRE = 0.25, 2.5  # m/s with no room, and m/s more for each metre of it
+RETREAT = 0.3  # of that while the robot makes off
+GENTLE, SPEED_PER_METRE = 0.30, 2.0  # m/s with no room, and m/s more for each metre of it
 HURRY_COST = 4.0  # seconds a second, at twice the speed that the room allows
+COMING = 0.6  # seconds within which who comes towards a robot makes it give way
+COMES = 0.4  # m/s from which somebody walks
+COMING_ROOM = 0.1  # metres that shall be left then
+COMING_COST = 8.0  # seconds for each metre of it that is missing
 
 NOBODY: Walkers = np.zeros((0, 4))
 
@@ -73,12 +78,43 @@ def toll(
     sure = max(0.0, 1.0 - seconds / BELIEVED)
     room = max(gap, 0.0)
     closeness = (EASY - room) / EASY
-    cost = PERSON_COST * closeness * closeness * pace / top_speed
+    cost = 0.0
     if gap < NEAR:
         cost += NEAR_COST * (NEAR - max(gap, -NEAR)) / NEAR
+    if approach < -0.5 * pace:
+        return RETREAT * sure * cost, False
+    cost += PERSON_COST * closeness * closeness * pace / top_speed
     if approach > 0.0:
         cost += HURRY_COST * max(0.0, approach / (GENTLE + SPEED_PER_METRE * room) - 1.0)
     return sure * cost, False
+
+
+@njit(cache=True)
+def surcharge(
+    walkers: Walkers, radius: float, seconds: float, x: float, y: float, yaw: float, speed: float
+) -> tuple[float, float]:
+    """Return what it costs, in seconds, to drive in some seconds where somebody walks, soon after and by then.
+
+    radius: of the robot's outline circle, metres; speed: m/s, forward. The first counts the closest that anyone gets
+    within COMING seconds more if both go on as they do, the second the present distance alone.
+    """
+    missing, missing_now = 0.0, 0.0
+    for index in range(len(walkers)):
+        along, across = walkers[index, 2], walkers[index, 3]
+        pace = math.sqrt(along * along + across * across)
+        if pace < COMES:
+            continue
+        ahead, aside = walkers[index, 0] + seconds * along - x, walkers[index, 1] + seconds * across - y
+        reach = BODY + STRIDE * min(1.0, pace / WALK) + radius + COMING_ROOM
+        missing_now = max(missing_now, reach - math.sqrt(ahead * ahead + aside * aside))
+        along, across = along - speed * math.cos(yaw), across - speed * math.sin(yaw)
+        square = max(along * along + across * across, 1e-6)
+        closest = min(-(ahead * along + aside * across) / square, COMING)
+        if closest > 0.0:
+            ahead, aside = ahead + closest * along, aside + closest * across
+            missing = max(missing, reach - math.sqrt(ahead * ahead + aside * aside))
+    sure = COMING_COST * max(0.0, 1.0 - seconds / BELIEVED)
+    return sure * missing, sure * missing_now
 
 
 def nearby(walkers: Walkers, x: float, y: float, reach: float) -> Walkers:

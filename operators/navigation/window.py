@@ -17,7 +17,7 @@ from numba import njit
 from operators.navigation.footprint import Body, Footprint, Surroundings, room
 from operators.navigation.lattice import Lattice
 from operators.navigation.motion import Twist, advance, towards
-from operators.navigation.people import NOBODY, Walkers, nearby, toll
+from operators.navigation.people import NOBODY, Walkers, nearby, surcharge, toll
 from operators.navigation.search import UNREACHED, Field
 
 STEP = 0.1  # seconds between the poses of an arc: one period of the controller
@@ -134,9 +134,10 @@ def _roll(
     padding: float,
     walkers: Walkers,
     tolls: npt.NDArray[np.float64],
+    surcharges: npt.NDArray[np.float64],
 ) -> int:
     """Fill in poses (steps + 1, 3) and the rest (steps + 1,); return the last step before a touch."""
-    speed, turn = speeds[0], turns[0]
+    speed, turn, worst = speeds[0], turns[0], 0.0
     for k in range(1, len(poses)):
         speed = towards(speed, wanted[0], limits.acceleration * STEP)
         turn = towards(turn, wanted[1], limits.turn_acceleration * STEP)
@@ -148,8 +149,11 @@ def _roll(
             return k - 1
         if len(walkers):
             tolls[k], into = toll(walkers, body.circumscribed, k * STEP, x, y, yaw, speed, limits.speed)
-            if into:
+            if into and abs(speed) > abs(speeds[k - 1]) - 0.9 * limits.acceleration * STEP:  # and does not brake
                 return k - 1
+            soon, met = surcharge(walkers, body.circumscribed, k * STEP, x, y, yaw, speed)
+            worst = max(worst, met)
+            surcharges[k] = max(soon, worst)
     return len(poses) - 1
 
 
@@ -160,6 +164,7 @@ def _judge(
     turns: npt.NDArray[np.float64],
     rooms: npt.NDArray[np.float64],
     tolls: npt.NDArray[np.float64],
+    surcharges: npt.NDArray[np.float64],
     free: int,
     limits: Limits,
     way: Way,
@@ -186,7 +191,7 @@ def _judge(
         column = math.floor((poses[k, 0] - way.x) / way.resolution)
         if row < 0 or row >= way.seconds.shape[0] or column < 0 or column >= way.seconds.shape[1]:
             break
-        total = spent + seconds_left(way, poses[k, 0], poses[k, 1])
+        total = spent + seconds_left(way, poses[k, 0], poses[k, 1]) + surcharges[k]
         missing = limits.speed - speeds[k]  # what is still to be gained costs the time that it takes
         total += missing * missing / (2.0 * limits.acceleration * limits.speed)
         ahead = float(way.direction[row, column])
@@ -218,7 +223,8 @@ def _choose(
     walkers: Walkers,
 ) -> tuple[float, float, float, npt.NDArray[np.float64]]:
     poses = np.empty((steps + 1, 3))
-    speeds, turns, rooms, tolls = np.empty(steps + 1), np.empty(steps + 1), np.empty(steps + 1), np.zeros(steps + 1)
+    speeds, turns, rooms = np.empty(steps + 1), np.empty(steps + 1), np.empty(steps + 1)
+    paid = np.zeros(steps + 1), np.zeros(steps + 1)  # to people: on the way, and on arrival
     poses[0, 0], poses[0, 1], poses[0, 2] = start
     speeds[0], turns[0] = speed_now, turn_now
     here = room(around, body, COMFORT, start[0], start[1], start[2])
@@ -228,8 +234,8 @@ def _choose(
     for i in range(len(speeds_wanted)):
         for j in range(len(turns_wanted)):
             wanted = (speeds_wanted[i], turns_wanted[j])
-            free = _roll(poses, speeds, turns, rooms, wanted, limits, around, body, needed, walkers, tolls)
-            total, at = _judge(poses, speeds, turns, rooms, tolls, free, limits, way)
+            free = _roll(poses, speeds, turns, rooms, wanted, limits, around, body, needed, walkers, *paid)
+            total, at = _judge(poses, speeds, turns, rooms, *paid, free, limits, way)
             total += SWERVE_COST * abs(turns_wanted[j] - turn_before)
             if total < best:
                 best, best_speed, best_turn = total, wanted[0], wanted[1]
@@ -295,12 +301,22 @@ class DynamicWindow:
         self._turn_before = turn
         return Choice(Twist(speed, turn), trajectory, best)
 
-    def free_steps(self, pose: tuple[float, float, float], twist: Twist, around: Surroundings, steps: int) -> int:
-        """Count the controller's periods for which a constant twist touches nothing, up to `steps`."""
+    def free_steps(
+        self,
+        pose: tuple[float, float, float],
+        twist: Twist,
+        around: Surroundings,
+        steps: int,
+        *,
+        walkers: Walkers = NOBODY,
+    ) -> int:
+        """Count the controller's periods for which a constant twist touches nothing and nobody, up to `steps`."""
         x, y, yaw = pose
         needed = least_room(self.padding, room(around, self._body, COMFORT, x, y, yaw))
         for step in range(steps):
             x, y, yaw = advance(x, y, yaw, twist.linear, twist.angular, STEP)
             if room(around, self._body, COMFORT, x, y, yaw) < needed:
+                return step
+            if toll(walkers, self._body.circumscribed, step * STEP, x, y, yaw, twist.linear, self.limits.speed)[1]:
                 return step
         return steps

@@ -23,12 +23,13 @@ class Habits(NamedTuple):
 
     reach: float = 10.0  # metres from the lidar: farther away, people do not matter
     gate: float = 0.5  # metres from where somebody is expected: a pace, half a step wide
-    near: float = 1.05  # metres from the lidar: of those nearer only the far side echoes, which tells a bearing
+    near: float = 1.05  # metres from the lidar: of those nearer but a part echoes, which tells half as well where
     near_gate: float = 0.35  # metres: other people's points are not theirs
     nearest: float = 0.5  # metres from the lidar: nobody steps onto the robot
     cell: float = 0.15  # metres between points of one clump
     least: int = 4  # points of somebody new
     depth: float = 0.1  # metres from the middle of what is seen to the middle of the body, away from the lidar
+    edge: float = 1.0  # metres from the lidar: nearer, it is the far side that is seen, farther the near side
     known: int = 3  # sightings that make a person
     apart: float = 0.25  # metres: two people nearer than this are one
     forgotten: float = 0.7  # seconds without being seen
@@ -87,8 +88,10 @@ class Tracker:
         )
 
     def _outside(self, seen: Floats, eye: Floats) -> Floats:
-        """Move what is seen of people (n, 2), their near side, to their middle."""
-        return self._at(seen, eye, np.sqrt(((seen - eye) ** 2).sum(axis=1)) + self.habits.depth)
+        """Move what is seen of people (n, 2), their near side or all that the blind ring leaves, to their middle."""
+        distance = np.sqrt(((seen - eye) ** 2).sum(axis=1))
+        depth = np.clip(distance - self.habits.edge, -self.habits.depth, self.habits.depth)
+        return self._at(seen, eye, distance + depth)
 
     def _at(self, place: Floats, eye: Floats, distance: Floats) -> Floats:
         """Move places (k, 2) to some distance (k,) from the lidar, at the bearing that they have."""
@@ -112,9 +115,7 @@ class Tracker:
         seen = number > 0
         deviation = MEASUREMENT * np.sqrt(1.0 + 8.0 / np.maximum(number, 1))  # few points tell less of the whole
         place = self._outside(middle, eye)
-        near = self._within(eye, self.habits.near)
-        distance = np.sqrt(((self.belief.place - eye) ** 2).sum(axis=1))
-        place = np.where(near[:, None], self._at(place, eye, distance), place)
+        deviation = np.where(self._within(eye, self.habits.near), 2.0 * deviation, deviation)
         belief = corrected(self.belief, place, deviation, seen)
         speed = np.sqrt((belief.velocity**2).sum(axis=1))
         slower = np.minimum(1.0, self.habits.fastest / np.maximum(speed, 1e-9))

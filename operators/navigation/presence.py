@@ -1,0 +1,162 @@
+"""People in the lidar's blind ring: remembered there for as long as the frame has a shadow where they stand.
+
+Nearer than 0.9 m the lidar is blind, but rays that somebody swallows return nothing: in a building every direction has
+an echo, or something near has taken it. Whoever was followed into the ring is there as long as such a gap is, and moves
+with it; where rays pass, nobody stands.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from operators.navigation.people import Walkers
+
+Floats = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+SECTORS = 120  # of 3 degrees: a thigh at arm's length is twice as wide
+BLIND = 1.15  # metres from the lidar: nearer, some or all of a person has no echo
+LEAST, MOST = 0.6, 0.78  # metres at which somebody stands who has just gone where nothing tells how near
+SEEN = 0.15  # seconds: who was seen in the last frame or so
+HALF_WIDTH = 0.1  # metres, of what is surely seen of a person
+ASIDE = math.radians(30.0)  # that a gap may have moved since the last frame but some
+NARROW = math.radians(60.0)  # a wider gap is that of a wall or a table
+SHADOW = math.radians(9.0)  # half of a person's
+FOLLOWING = 0.5  # share of the way into a gap by which a frame moves somebody
+DOUBTS = 5  # frames without a gap after which nobody is there
+MEMORY = 50  # frames for which a wide gap, of a wall or a table, may hide somebody
+REST, RECEDING = 0.72, 0.4  # metres to which people step back, and the share of the missing way in a frame
+STRANGER = math.radians(5.0), math.radians(22.0)  # half a gap that nothing else explains: somebody's, whoever it is
+NOTICED = 3  # frames of such a gap after which it counts
+ONE = 0.25  # metres: two nearer to each other are one
+
+
+class Hidden(NamedTuple):
+    """Somebody in the ring whom the lidar does not see."""
+
+    identity: int  # below 0: a stranger's
+    x: float  # metres, world
+    y: float
+    doubts: int  # frames in a row without a gap
+    frames: int  # since the last sighting
+
+
+def gaps(passed: Flags) -> list[tuple[float, float]]:
+    """Return the middle and half the width, in radians, of each run of two or more sectors that no ray passed."""
+    if not passed.any():
+        return [(0.0, math.pi)]
+    count, first = len(passed), int(np.argmax(passed))
+    empty = np.flatnonzero(~np.roll(passed, -first))
+    found = []
+    for run in np.split(empty, np.flatnonzero(np.diff(empty) > 1) + 1):
+        if len(run) >= 2:
+            middle = (first + 0.5 * float(run[0] + run[-1] + 1)) * 2.0 * math.pi / count
+            found.append((middle, len(run) * math.pi / count))
+    return found
+
+
+def _turn(to: float, origin: float) -> float:
+    return (to - origin + math.pi) % (2.0 * math.pi) - math.pi
+
+
+class Presence:
+    """Who is around, those included who went where the lidar is blind."""
+
+    def __init__(self) -> None:
+        self.hidden: list[Hidden] = []
+        self.strangers = 0
+        self._passed: Flags = np.ones(SECTORS, np.bool_)
+        self._things: Flags = np.zeros(SECTORS, np.bool_)
+        self._eye = (0.0, 0.0)
+
+    def observe(self, points: npt.NDArray[np.float32], world_from_lidar: Floats, things: Floats) -> None:
+        """Take in what a frame shows of all that is not people: points (n, 3) in the lidar frame.
+
+        things: places (m, 2) of what is known to stand in the ring, in the world: it swallows rays, too.
+        """
+        x, y = points[:, 0].astype(np.float64), points[:, 1].astype(np.float64)
+        bearing = np.arctan2(y, x) + math.atan2(world_from_lidar[1, 0], world_from_lidar[0, 0])
+        sector = np.floor(bearing * (SECTORS / (2.0 * math.pi))).astype(np.int64) % SECTORS
+        self._passed = np.bincount(sector, minlength=SECTORS) > 0
+        self._eye = float(world_from_lidar[0, 3]), float(world_from_lidar[1, 3])
+        bearing = np.arctan2(things[:, 1] - self._eye[1], things[:, 0] - self._eye[0])
+        sector = np.floor(bearing * (SECTORS / (2.0 * math.pi))).astype(np.int64) % SECTORS
+        self._things = np.bincount(sector, minlength=SECTORS) > 0
+
+    def company(self, identity: npt.NDArray[np.int32], walkers: Walkers, unseen: npt.NDArray[np.float32]) -> Walkers:
+        """Return the people (k, 4) to keep clear of, from those (n, 4) whom a tracker follows.
+
+        unseen: (n,) seconds since each was seen. Who is not seen and in the ring is where the gaps say.
+        """
+        eye = np.array(self._eye)
+        offset = walkers[:, :2] - eye
+        away = np.hypot(offset[:, 0], offset[:, 1])
+        bearing = np.arctan2(offset[:, 1], offset[:, 0])
+        seen = unseen < SEEN
+        passed = self._passed.copy()
+        for index in np.flatnonzero(seen & (away > 0.5 * BLIND)):  # their echoes came back, too
+            half = math.atan2(HALF_WIDTH, float(away[index]))
+            reach = int(half * SECTORS / (2.0 * math.pi))
+            middle = math.floor(bearing[index] * (SECTORS / (2.0 * math.pi)))
+            passed[np.arange(middle - reach, middle + reach + 1) % SECTORS] = True
+        known = {person.identity for person in self.hidden}
+        for index in np.flatnonzero(~seen & (away < BLIND)):
+            if int(identity[index]) not in known:
+                share = min(max(float(away[index]), LEAST), MOST) / max(float(away[index]), 1e-6)
+                x, y = eye + share * offset[index]
+                self.hidden.append(Hidden(int(identity[index]), float(x), float(y), 0, 0))
+        visible = np.flatnonzero(seen)
+        empty = gaps(passed)
+        self.hidden = self._looked_for(empty, set(identity[visible].tolist()), walkers[visible, :2])
+        self._notice(empty)
+        known_ones = [one for one in self.hidden if one.identity >= 0 or one.frames >= NOTICED]
+        still = np.array([[one.x, one.y, 0.0, 0.0] for one in known_ones]).reshape(-1, 4)
+        return np.concatenate([walkers[seen | (away >= BLIND)], still])
+
+    def _looked_for(self, empty: list[tuple[float, float]], again: set[int], visible: Floats) -> list[Hidden]:
+        """Move the hidden to their gaps; let go of those seen elsewhere, looked through, or one with another."""
+        kept: list[Hidden] = []
+        for person in self.hidden:
+            if person.identity in again:
+                continue
+            x, y = person.x - self._eye[0], person.y - self._eye[1]
+            away, bearing = math.hypot(x, y), math.atan2(y, x)
+            nearest, middle, half = math.inf, 0.0, 0.0
+            for centre, width in empty:
+                off = abs(_turn(centre, bearing)) - width
+                if off < nearest:
+                    nearest, middle, half = off, centre, width
+            if nearest < ASIDE and away < BLIND:
+                doubts = 0 if half < 0.5 * NARROW or person.frames < MEMORY else DOUBTS
+                off = _turn(middle, bearing)
+                bearing += FOLLOWING * math.copysign(max(0.0, abs(off) - max(0.0, half - SHADOW)), off)
+            else:
+                doubts = person.doubts + 1
+            away += max(0.0, RECEDING * (REST - away))
+            place = self._eye[0] + away * math.cos(bearing), self._eye[1] + away * math.sin(bearing)
+            others = [*visible.tolist(), *((other.x, other.y) for other in kept)]
+            if doubts < DOUBTS and all(math.dist(place, other) > ONE for other in others):
+                kept.append(Hidden(person.identity, *place, doubts, person.frames + 1))
+        return kept
+
+    def _notice(self, empty: list[tuple[float, float]]) -> None:
+        """Suspect somebody in each narrow gap in which nobody is believed, and that no thing explains."""
+        for middle, half in empty:
+            if not STRANGER[0] <= half <= STRANGER[1]:
+                continue
+            x, y = math.cos(middle), math.sin(middle)
+            sectors = np.arange(
+                math.floor((middle - half) * SECTORS / (2.0 * math.pi)),
+                math.floor((middle + half) * SECTORS / (2.0 * math.pi)) + 1,
+            )
+            owned = any(
+                abs(_turn(math.atan2(one.y - self._eye[1], one.x - self._eye[0]), middle)) < half + SHADOW
+                for one in self.hidden
+            )
+            if not owned and not self._things[sectors % SECTORS].any():
+                self.strangers += 1
+                self.hidden.append(Hidden(-self.strangers, self._eye[0] + REST * x, self._eye[1] + REST * y, 0, 0))
