@@ -55,6 +55,7 @@ def test_the_report_holds_both_tables_and_a_picture_of_each(tmp_path: Path):
     assert page.count("data:image/png;base64,") == 2
     assert "3.80" in page
     assert "AMCL" in page
+    assert "1.25" in page  # with the network over the truth
 
 
 @pytest.mark.parametrize("method", METHODS)
