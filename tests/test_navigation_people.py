@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from operators.navigation.costmap import Costmap
 from operators.navigation.footprint import Footprint, Surroundings
 from operators.navigation.lattice import Lattice
 from operators.navigation.motion import Twist, advance, towards
@@ -130,6 +131,21 @@ def test_robot_gives_way_to_who_comes_towards_it(ahead, speed):
 def test_robot_that_drives_brakes_for_who_comes_towards_it():
     for ahead in (0.8, 1.0, 1.3):
         assert choose([[ahead, 0.0, -0.8, 0.0]], now=Twist(0.6, 0.0)).target.linear <= 0.0
+
+
+def test_robot_does_not_back_off_into_somebody_to_get_loose():
+    window, behind = DynamicWindow(Footprint(), Limits()), np.array([[-0.52, 0.0, 0.0, 0.0]])
+    assert window.free_steps((0.0, 0.0, 0.0), Twist(-0.2, 0.0), OPEN, 3) == 3
+    assert window.free_steps((0.0, 0.0, 0.0), Twist(-0.2, 0.0), OPEN, 3, walkers=behind) == 0
+    assert window.free_steps((0.0, 0.0, 0.0), Twist(0.2, 0.0), OPEN, 3, walkers=behind) == 3
+
+
+def test_costmap_tells_what_stands_near():
+    costmap = Costmap(lethal=0.2, inflation=0.8)
+    cells = np.zeros((80, 80), np.int8)
+    cells[40, 50] = cells[40, 75] = 100
+    costmap.set_map(cells, (-2.0, -2.0), 0.05)
+    assert costmap.standing(0.0, 0.0, 1.0) == pytest.approx(np.array([[0.525, 0.025]]))
 
 
 @given(walkers, numbers, numbers, st.floats(0.0, 2.0), st.floats(-math.pi, math.pi), st.floats(-0.6, 1.3))

@@ -85,6 +85,20 @@ def test_who_steps_into_the_blind_ring_is_remembered_there_and_comes_to_rest():
     assert len(people.identity) == 0
 
 
+@pytest.mark.parametrize("middle", [0.8, 0.9, 1.0, 1.2])
+def test_who_is_half_in_the_blind_ring_is_not_mistaken_for_far_away(middle):
+    """The lidar sees what of a body is beyond 0.9 m: of somebody near, the far side alone."""
+    angle = np.linspace(-np.pi, np.pi, 200)
+    whole = np.stack([middle + 0.15 * np.cos(angle), 0.15 * np.sin(angle), np.ones(200)], axis=1)
+    away = np.hypot(whole[:, 0], whole[:, 1])
+    seen = whole[(away > 0.9) & ((whole[:, 0] < middle) | (away < 1.05))]
+    tracker = Tracking()
+    for step in range(10):
+        people = tracker.observe(seen, (0.0, 0.0), PERIOD if step else 0.0)
+    assert len(people.identity) == 1
+    assert abs(people.place[0, 0] - middle) < 0.13
+
+
 def test_passing_glance_is_nobody():
     _, people = follow([straight(4.0, 0.0, 0.0, 0.0)], 1.0, hidden=lambda index, time: time < 0.85)
     assert len(people.identity) == 0
