@@ -26,6 +26,7 @@ from graph.errors import UserError
 from graph.ledger import Ref
 from graph.loading import load_class
 from graph.node import Emission, Node
+from graph.provenance import cpu_class, versions
 from graph.recording import Recording
 from graph.replay import replay
 from graph.replay_report import Replay, lines
@@ -142,6 +143,12 @@ def tolerable(report: Replay, tolerance: float = TOLERANCE) -> bool:
     return bool(report.warnings) and near
 
 
+def elsewhere(recording: Recording) -> bool:
+    """Say whether a recording that holds digests comes from other processors or versions: other bits."""
+    digests = any("digest" in spec.record.values() for spec in recording.run.specs)
+    return digests and (recording.run.cpu != cpu_class() or recording.run.versions != versions())
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add --update-references."""
     group = parser.getgroup("retracer")
@@ -173,7 +180,11 @@ def replayed(request: pytest.FixtureRequest) -> Replay:
         report = replay(recording)
     except UserError as error:
         pytest.fail(str(error), pytrace=False)
-    assert tolerable(report), "\n".join(lines(report))
+    if not tolerable(report):
+        told = "\n".join(lines(report))
+        if elsewhere(recording):
+            pytest.skip(f"what is kept as digests cannot be held within a tolerance: {told}")
+        pytest.fail(told, pytrace=False)
     text, written = reference(recording), Path(path).with_suffix(".txt")
     if request.config.getoption("--update-references"):
         written.write_text(text)
