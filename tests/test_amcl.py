@@ -43,10 +43,9 @@ def turns(localizer, count=6):
     return told
 
 
-@pytest.mark.parametrize("graph", ["untaught.yaml", "operators/rounds/robot.yaml"])
 @pytest.mark.parametrize("kind", ["amcl", "gmapping"])
-def test_each_is_a_drop_in_for_the_localizer_by_one_line(kind: str, graph: str):
-    report = check(graph, swaps=[f"localizer=operators.{kind}:{kind.capitalize()}"])
+def test_each_is_a_drop_in_for_the_localizer_by_one_line(kind: str):
+    report = check("untaught.yaml", swaps=[f"localizer=operators.{kind}:{kind.capitalize()}"])
     assert not report.mistakes
 
 
