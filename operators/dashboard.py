@@ -323,7 +323,7 @@ class Dashboard(Sink):
             self.display.scene.number("plots/latency", f"frame_to_{port}", age)
         if isinstance(message, PointCloud) and not self.aimed and (eye := self.display.eye()) is not None:
             self.aimed = True  # once: from now on the camera is the user's
-            self.stream.send_blueprint(robot_layout(eye=eye))
+            self.stream.send_blueprint(robot_layout(eye=eye, hidden=list(self.display.scene.hidden)))
 
 
 def attach(graph: Graph, config: dict[str, Any] | None = None) -> Graph:

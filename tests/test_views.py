@@ -140,6 +140,18 @@ def test_a_grid_is_cropped_to_what_is_known_and_turned_as_images_are(tmp_path: P
     np.testing.assert_array_equal(image, expected[::-1])
 
 
+def test_an_annotated_map_shows_classes_and_what_moves(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path / "map.rrd")
+    scene.at(0)
+    points, movable = np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]], np.float32), np.array([0.0, 1.0], np.float32)
+    scene.map("map", points, incremental=False, movable=movable, label=np.array([2, 3], np.uint8))
+    finish(scene.stream, patience=10.0)
+    assert list(scene.hidden) == ["world/map/movable"]
+    drawn = [rows(tmp_path / "map.rrd", f"world/map{part}/0")[-1] for part in ("", "/movable")]
+    assert drawn[0]["Points3D:positions"] == drawn[1]["Points3D:positions"]
+    assert drawn[0]["Points3D:colors"] != drawn[1]["Points3D:colors"]
+
+
 def test_a_full_map_takes_the_place_of_all_before(tmp_path: Path) -> None:
     scene = scene_of(tmp_path / "map.rrd")
     for second, incremental in enumerate((False, True, True, False)):

@@ -36,6 +36,7 @@ class Scene:
         self._maps: dict[str, LayeredCloud] = {}
         self._trails: dict[str, Trail] = {}
         self._named: set[str] = set()
+        self.hidden: dict[str, None] = {}  # entities that a layout does well not to show at first
         rr.set_log_time_enabled(False, recording=stream)
         rr.set_log_tick_enabled(False, recording=stream)
         classes = [*enumerate(palette.TRUTH), *enumerate(palette.LABELS, palette.FIRST_LABEL)]
@@ -132,15 +133,25 @@ class Scene:
         movable: Points | None = None,
         label: Points | None = None,
     ) -> None:
-        """Draw the points (n, 3) of a map, or add them to it; coloured by label, else movable (n,), else by height."""
-        cloud = self._maps.setdefault(name, LayeredCloud())
-        changed = [] if incremental else cloud.clear()
+        """Draw the points (n, 3) of a map, or add them to it; coloured by label, else movable (n,), else by height.
+
+        Where both are known, movable is an entity of its own, `world/<name>/movable`, to be shown at first or not.
+        """
+        if label is not None and movable is not None:
+            self.hidden[f"world/{name}/movable"] = None
+            self._layer(f"{name}/movable", points, palette.movable_colours(movable), incremental=incremental)
         if label is not None:
             colours = palette.class_colours(label, palette.LABELS)
         elif movable is not None:
             colours = palette.movable_colours(movable)
         else:
             colours = palette.height_colours(points[:, 2])
+        self._layer(name, points, colours, incremental=incremental)
+
+    def _layer(self, name: str, points: Points, colours: palette.Bytes, *, incremental: bool) -> None:
+        """Draw coloured points as layers of an entity, or add them to it."""
+        cloud = self._maps.setdefault(name, LayeredCloud())
+        changed = [] if incremental else cloud.clear()
         changed += cloud.add(points, colours)
         for layer in {layer.level: layer for layer in changed}.values():
             drawn = rr.Points3D(layer.points, colors=layer.colours, radii=_MAP_POINT, point_shading="flat")

@@ -92,7 +92,7 @@ def draw(
     def layout() -> rrb.Blueprint:
         if not shown:
             return numbers_layout(list(plots))
-        hidden = [f"world/{topic}" for topic in clouds if topic != best]
+        hidden = [*(f"world/{topic}" for topic in clouds if topic != best), *display.scene.hidden]
         usual = float(np.percentile(display.latencies, 99)) if display.latencies else 0.0
         return robot_layout(eye=display.eye(), hidden=hidden, others=list(plots), slowest=1.5 * usual or None)
 
