@@ -88,6 +88,8 @@ class _Review:
                 except UserError as error:
                     self.draft.add(("operators", name, "run"), f"{name}: {error}")
         for name, kind in self.kinds.items():
+            if self.draft.swapped(name):
+                self._let_go(graph, name, kind)
             self._look_at_config(graph, name, kind)
             self._look_at_ports(graph, name, kind)
         feeds = [(name, port, edge) for name, entry in graph.operators.items() for port, edge in entry.inputs.items()]
@@ -102,6 +104,19 @@ class _Review:
 
     def _called(self, name: str) -> str:
         return f"{name} ({self.kinds[name].__qualname__})"
+
+    def _let_go(self, graph: Graph, name: str, kind: type[Operator]) -> None:
+        """Take from a swapped operator what the file told the class before it and this one does not know."""
+        entry = graph.operators[name]
+        fields = {field.encode_name for field in msgspec.structs.fields(kind.Config)}
+        for section, known in (("config", fields), ("record", ports_of(kind).outputs.keys())):
+            written = getattr(entry, section)
+            for key in list(written) if isinstance(written, dict) else ():
+                path = ("operators", name, section, key)
+                if key not in known and not self.draft.told(path):
+                    del written[key]
+                    text = f"{section} {name}.{key} was the former class's; {self._called(name)} goes without"
+                    self.warnings.append(self.draft.mistake(path, text, key=True))
 
     def _look_at_config(self, graph: Graph, name: str, kind: type[Operator]) -> None:
         entry = graph.operators[name]

@@ -226,7 +226,11 @@ class Draft:
     def swapped(self, name: str) -> KeyPath | None:
         """Return the path of an operator's class if `--swap` has set it."""
         path = ("operators", name, "run")
-        return path if path in self._options else None
+        return path if self.told(path) else None
+
+    def told(self, path: KeyPath) -> bool:
+        """Say whether an option of the command line has set what stands at a path."""
+        return path in self._options
 
     def add(self, path: KeyPath, text: str, *, key: bool = False) -> None:
         """Note a mistake at a path, unless the file says there what cannot even be read."""

@@ -151,6 +151,23 @@ def test_a_good_swap_has_no_mistakes(good: Path) -> None:
     assert check(good, [], ["relay=tests.sample_operators:Slow"]).mistakes == []
 
 
+def test_a_swapped_class_goes_without_what_only_the_former_knew(good: Path) -> None:
+    operator = "{run: tests.sample_operators:Failing, inputs: {count: counter/count}, config: {at: 3, offset: 2}}"
+    good.write_text(
+        f"clock: {{end: counter}}\noperators:\n  counter: {{run: tests.sample_operators:Counter, inputs: "
+        f"{{tick: timer/10hz}}}}\n  relay: {operator}\n"
+    )
+    report = check(good, [], ["relay=tests.sample_operators:Relay"])
+    assert report.mistakes == []
+    assert [str(mistake) for mistake in report.warnings] == [
+        f"{good}:4: config relay.at was the former class's; relay (Relay) goes without"
+    ]
+    assert report.graph is not None
+    assert report.graph.operators["relay"].config == {"offset": 2}
+    told = check(good, ["relay.at=4"], ["relay=tests.sample_operators:Relay"])
+    assert "relay.at is not a known key" in str(told.mistakes[0])
+
+
 @pytest.mark.parametrize("clock", ["{mode: realtime}", "{duration: 1s}", "{duration: 1s, end: adder_source}"])
 def test_a_graph_ends_as_it_says(good: Path, clock: str) -> None:
     good.write_text(GOOD.replace("{end: counter}", clock))
