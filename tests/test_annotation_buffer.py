@@ -14,7 +14,7 @@ from operators.annotation.buffer import Classing, classify, known_map, pooled
 from operators.annotation.first_map import thinned
 from operators.annotation.floor import floor_points
 from operators.annotation.projection import Projector
-from operators.annotation.refinement import Refinement, refine
+from operators.annotation.refinement import Refinement, refine, seen_through, walls_of
 from operators.annotation.session import GROUND, LONG_TERM, PERMANENT, SHORT_TERM, UNCERTAIN, Scan
 from operators.annotation.tally import Tally, by_truth, measures, moved_doors
 from operators.pointmap import MapPoints, VoxelMap
@@ -232,3 +232,24 @@ def test_a_door_moved_if_it_stands_otherwise_in_another_session(turn, moved):
     counts = by_truth(sessions, moved_doors(sessions))
     assert sum(counts["door" if moved else "door never moved"]) == 600
     assert measures(counts)["recall"]["door" if moved else "door never moved"] == 0.5
+
+
+def test_who_looks_through_long_walls_is_known_by_them():
+    random = np.random.default_rng(5)
+
+    def upright(length: float, y: float) -> np.ndarray:
+        count = int(1000 * length)
+        return np.stack([random.uniform(0, length, count), np.full(count, y), random.uniform(0, 2, count)], axis=1)
+
+    points = np.concatenate([upright(6.0, 0.0), upright(1.0, 3.0)]).astype(np.float32)
+    normals = np.tile(np.array([0.0, -1.0, 0.0], np.float32), (len(points), 1))
+    walls = walls_of(MapPoints(points, normals, np.ones(len(points), np.float32)))
+    assert walls[:6000].mean() > 0.99
+    assert not walls[6000:].any()  # a leaf of a door may go
+    movable, looks = np.zeros(len(points), np.float32), np.full(len(points), 20, np.int32)
+    movable[6000:] = 1.0
+    assert seen_through(walls, movable, looks) == 0.0
+    movable[:600] = 1.0
+    assert seen_through(walls, movable, looks) == pytest.approx(0.1, abs=0.01)
+    looks[:600] = 3  # too few to say so
+    assert seen_through(walls, movable, looks) == 0.0

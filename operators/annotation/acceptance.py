@@ -25,6 +25,7 @@ class Acceptance(NamedTuple):
     least_inliers: float = 0.7  # median over the frames
     least_overlap: float = 0.5  # share of what it saw above the floor that the map has
     least_frames: int = 10
+    most_seen_through: float = 0.025  # share of the long walls that it looked at; poses a hand's breadth off give 0.04
 
 
 class Evidence(NamedTuple):

@@ -34,6 +34,25 @@ def trace_map(voxels: VoxelMap, session: Session, rays: RaySettings) -> tuple[Fl
     return tracer.movable(), tracer.looks()
 
 
+def walls_of(cloud: MapPoints, settings: Refinement | None = None) -> npt.NDArray[np.bool_]:
+    """Say of each point of a map (n,) whether it belongs to a flat upright piece too long to be moved."""
+    settings = Refinement() if settings is None else settings
+    pieces = flat_pieces(cloud.points, cloud.normals)
+    return length_of_piece(pieces, cloud.points) > settings.longest
+
+
+def seen_through(
+    walls: npt.NDArray[np.bool_], movable: Floats, looks: npt.NDArray[np.int32], settings: Refinement | None = None
+) -> float:
+    """Return what share of the walls (n,) that a session looked at often enough it says it saw through.
+
+    Whoever does so has wrong poses: ICP may settle on the other face of a wall, and all of its residuals be small.
+    """
+    settings = Refinement() if settings is None else settings
+    known = walls & (looks >= RaySettings().least_looks)
+    return float((movable[known] >= settings.threshold).mean()) if known.any() else 0.0
+
+
 def refine(
     cloud: MapPoints, movable: Iterable[Floats], settings: Refinement | None = None
 ) -> tuple[MapPoints, npt.NDArray[np.bool_]]:

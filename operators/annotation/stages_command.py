@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from graph.check import require
 from graph.codec import digest
@@ -22,7 +23,7 @@ from operators.annotation.acceptance import Acceptance, accept
 from operators.annotation.alignment import align_session
 from operators.annotation.buffer import Classing, classify, new_points, trace_new
 from operators.annotation.files import save_buffer, shared_map
-from operators.annotation.refinement import Refinement, trace_map
+from operators.annotation.refinement import Refinement, seen_through, trace_map, walls_of
 from operators.annotation.session import Floats
 from operators.pointmap import MapPoints, Settings, VoxelMap, load_map
 from operators.pointray import RaySettings
@@ -126,10 +127,25 @@ def examine(job: Job, path: Path, tell: Any) -> Examined:
     examined = Examined(session.name, not reasons, reasons, evidence, key)
     if examined.accepted:
         movable, looks = trace_map(voxels, session, job.rays)
-        save_arrays(traces(job, examined), movable=movable, looks=looks)
+        through = seen_through(shared_walls(job.map, job.map_digest), movable, looks, job.refinement)
+        evidence["walls_seen_through"] = round(through, 5)
+        if through > job.acceptance.most_seen_through:
+            most = 100 * job.acceptance.most_seen_through
+            reason = (
+                f"it looks through {100 * through:.1f} % of the long walls, so its poses are off; {most:g} % may be"
+            )
+            examined = examined._replace(accepted=False, reasons=(reason,))
+        else:
+            save_arrays(traces(job, examined), movable=movable, looks=looks)
     evidence["seconds_examined"] = round(time.perf_counter() - begin, 2)
     write_json(verdict_file, examined._asdict())
     return examined
+
+
+@functools.lru_cache(maxsize=1)
+def shared_walls(path: Path, _digest: str) -> npt.NDArray[np.bool_]:
+    """Return which points of the map belong to long walls; found once in each process."""
+    return walls_of(shared_cloud(path, _digest)[0])
 
 
 @functools.lru_cache(maxsize=1)
