@@ -4,6 +4,7 @@ BIN := .venv/bin
 EXTRAS := $(shell $(PYTHON) -c "import sys; print('sim,view,ros,evo,dev,bench' if sys.version_info < (3, 12) else 'view,ros,evo,dev,bench')")
 KERNELS := $(shell grep -rl --include='*.py' njit operators sim)
 RECORD ?=
+GRAPH ?= graph.yaml
 
 .PHONY: setup launch test test-all bench lint clean fresh
 
@@ -23,7 +24,7 @@ setup: .venv/kernels
 	@touch $@
 
 launch: setup
-	$(BIN)/retracer launch graph.yaml $(if $(RECORD),--record $(RECORD))
+	$(BIN)/retracer launch $(GRAPH) $(if $(RECORD),--record $(RECORD))
 
 test: setup
 	$(BIN)/python -m pytest -n 3 -m "not slow"
