@@ -2,8 +2,8 @@
 
 simulator:
   run: operators.simulator:Simulator
-  inputs: {tick: timer/10hz, drive: {from: planner/drive, delay: 100ms}, pose: {from: localizer/pose, delay: 100ms},
-    plan: {from: planner/plan, delay: 100ms}}
+  inputs: {tick: timer/10hz, drive: {from: planner/drive, delay: 150ms}, pose: {from: localizer/pose, delay: 150ms},
+    plan: {from: planner/plan, delay: 150ms}}
   config: {building: sim/buildings/default.yaml, scenario: easy, tour: A, seed: 1}
 
 The robot is put at the start pose of its tour and knows it: odometry begins at world_from_base of the first tick, so

@@ -42,14 +42,20 @@ def walls_of(cloud: MapPoints, settings: Refinement | None = None) -> npt.NDArra
 
 
 def seen_through(
-    walls: npt.NDArray[np.bool_], movable: Floats, looks: npt.NDArray[np.int32], settings: Refinement | None = None
+    walls: npt.NDArray[np.bool_],
+    movable: Floats,
+    looks: npt.NDArray[np.int32],
+    settings: Refinement | None = None,
+    *,
+    least_looks: int = RaySettings().least_looks,
 ) -> float:
-    """Return what share of the walls (n,) that a session looked at often enough it says it saw through.
+    """Return what share of the walls (n,) a session says it saw through, of those with enough looks (n,).
 
-    Whoever does so has wrong poses: ICP may settle on the other face of a wall, and all of its residuals be small.
+    movable: (n,) probability. Whoever does so has wrong poses: ICP may settle on the other face of a wall, and all of
+    its residuals be small.
     """
     settings = Refinement() if settings is None else settings
-    known = walls & (looks >= RaySettings().least_looks)
+    known = walls & (looks >= least_looks)
     return float((movable[known] >= settings.threshold).mean()) if known.any() else 0.0
 
 

@@ -127,7 +127,8 @@ def examine(job: Job, path: Path, tell: Any) -> Examined:
     examined = Examined(session.name, not reasons, reasons, evidence, key)
     if examined.accepted:
         movable, looks = trace_map(voxels, session, job.rays)
-        through = seen_through(shared_walls(job.map, job.map_digest), movable, looks, job.refinement)
+        walls = shared_walls(job.map, job.map_digest, job.refinement)
+        through = seen_through(walls, movable, looks, job.refinement, least_looks=job.rays.least_looks)
         evidence["walls_seen_through"] = round(through, 5)
         if through > job.acceptance.most_seen_through:
             most = 100 * job.acceptance.most_seen_through
@@ -143,9 +144,9 @@ def examine(job: Job, path: Path, tell: Any) -> Examined:
 
 
 @functools.lru_cache(maxsize=1)
-def shared_walls(path: Path, _digest: str) -> npt.NDArray[np.bool_]:
-    """Return which points of the map belong to long walls; found once in each process."""
-    return walls_of(shared_cloud(path, _digest)[0])
+def shared_walls(path: Path, map_digest: str, refinement: Refinement) -> npt.NDArray[np.bool_]:
+    """Return which points (n,) of the map belong to long walls; found once in each process."""
+    return walls_of(shared_cloud(path, map_digest)[0], refinement)
 
 
 @functools.lru_cache(maxsize=1)
