@@ -89,6 +89,8 @@ def thin(args: argparse.Namespace) -> int:
     """Make a smaller map of a map. Raises UserError where it cannot be read or written."""
     if args.thin is None:
         raise UserError(f"{args.session} is a map already; --thin 0.1 makes a smaller one of it")
+    if not args.session.is_file():
+        raise UserError(f"{args.session}: no such map")
     try:
         whole = load_map(args.session)
         few = thinned(whole, args.thin)
