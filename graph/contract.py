@@ -29,7 +29,8 @@ class Operator:
     """A deterministic state machine: messages in, messages out; no clock, no socket, no unseeded random number.
 
     `on_<port>(message)` returns None, one Outputs, End, or an iterator of them. Ports are handled in the order of the
-    class body, base classes first. `on_start` runs at the first stamp, `on_end` once at the end.
+    class body, base classes first. `on_start` runs at the first stamp, `on_end` once at the end. A method annotated
+    `-> None` never says anything, so nobody waits for what it might have said.
     """
 
     class Config(msgspec.Struct):
@@ -39,6 +40,7 @@ class Operator:
         """No outputs."""
 
     config: Any
+    stamp: int = 0  # of the present call, nanoseconds of logical time: when its message arrived; set by the runtime
 
     def __init__(self, config: Any = None) -> None:
         self.config = type(self).Config() if config is None else config
@@ -74,6 +76,7 @@ class Ports(msgspec.Struct, frozen=True):
 
     inputs: dict[str, type[msgspec.Struct]]
     outputs: dict[str, type[msgspec.Struct]]
+    silent: frozenset[str] = frozenset()  # inputs whose methods are annotated `-> None`
 
 
 def _message_type(hint: Any, where: str) -> type[msgspec.Struct]:
@@ -103,6 +106,7 @@ def method_hints(kind: type[Operator], method: str) -> dict[str, Any]:
 def _read_ports(kind: type[Operator]) -> Ports:
     name = kind.__qualname__
     inputs: dict[str, type[msgspec.Struct]] = {}
+    silent: set[str] = set()
     for base in reversed(kind.__mro__):
         for attribute, method in vars(base).items():
             port = attribute.removeprefix("on_")
@@ -116,6 +120,8 @@ def _read_ports(kind: type[Operator]) -> Ports:
             if len(parameters) != 1 or parameters[0] not in hints:
                 raise ContractError(f"{name}.{attribute} wants exactly one annotated parameter, the message")
             inputs[port] = _message_type(hints[parameters[0]], f"{name}.{attribute}")
+            if hints.get("return") is types.NoneType:
+                silent.add(port)
     try:
         hints = typing.get_type_hints(kind.Outputs)
     except NameError as error:
@@ -123,7 +129,7 @@ def _read_ports(kind: type[Operator]) -> Ports:
     outputs = {
         field: _message_type(hints[field], f"{name}.Outputs.{field}") for field in kind.Outputs.__struct_fields__
     }
-    return Ports(inputs, outputs)
+    return Ports(inputs, outputs, frozenset(silent))
 
 
 def kind_of(kind: type[Operator]) -> Literal["operator", "source", "sink"]:

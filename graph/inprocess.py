@@ -33,6 +33,7 @@ class Local:
         self.schedule: Lockstep | Realtime = Realtime(spec) if spec.kind == "sink" else Lockstep(spec)
         self.deliver = deliver
         self.emissions: list[Emission] = []
+        self.through = -1  # how far it is, as the others know
         self.done = False
 
     def emit(self, emission: Emission) -> None:
@@ -147,11 +148,15 @@ def _now(locals_: list[Local]) -> int:
 
 
 def _spread(item: Local, locals_: list[Local]) -> bool:
-    """Tell an operator's mark to all; say whether it was news."""
-    if (mark := item.mark()) is None:
+    """Tell an operator's mark to all, and how far it is; say whether it was news."""
+    mark = item.mark()
+    through = item.schedule.through() if isinstance(item.schedule, Lockstep) else item.through
+    if mark is None and through <= item.through:
         return False
+    item.through = through
     for other in locals_:
         if isinstance(other.schedule, Lockstep):
-            other.schedule.mark(item.spec.name, mark)
-            other.schedule.consumer_at(item.spec.name, mark.watermark)
+            if mark is not None:
+                other.schedule.mark(item.spec.name, mark)
+            other.schedule.consumer_at(item.spec.name, through)
     return True

@@ -3,6 +3,8 @@
 The rules are those of Chandy, Misra and Bryant. A message with stamp s arrives over an edge with delay d at s + d.
 Arrivals are handled in the order (arrival, port, sequence), and only once no earlier one can still come. Whoever owns
 a `Lockstep` feeds it messages and marks in any interleaving; what it hands out never depends on the interleaving.
+Two things let operators work at the same time whom plain rules would make wait for each other: an arrival waits only
+for what may come before it, by time or by port; and no promise waits for what arrives where nothing is ever said.
 """
 
 from __future__ import annotations
@@ -71,6 +73,7 @@ class Lockstep:
         self.pending: list[Arrival] = [Arrival(delay, port, 0, 0, None) for port, _, delay in self.timers]
         heapq.heapify(self.pending)
         self.periods = {port: period for port, period, _ in self.timers}
+        self.silent = {port for port, edge in enumerate(spec.inputs) if edge.silent}
         self.flow = dict.fromkeys((c for c in spec.consumers if c != spec.name), -1)
         self.control = INFINITY if spec.end in (None, spec.name) else -1  # how far the operator that ends the run is
         self.end = INFINITY if spec.duration is None else spec.duration
@@ -124,12 +127,20 @@ class Lockstep:
         horizon = min((edge.watermark for edge in self.edges), default=INFINITY)
         return min(horizon, self.stream_stamp)
 
+    def _first(self, arrival: Arrival) -> bool:
+        """Say whether nothing can still come that is to be handled before an arrival."""
+        time, port = arrival.time, arrival.port
+        for edge in self.edges:
+            if edge.port != port and edge.watermark < (time if edge.port < port else time - 1):
+                return False  # what comes over one edge comes in order
+        return True
+
     def next(self) -> Arrival | None:
         """Return the arrival that may be handled now, and forget it; None if there is none yet."""
         if not self.pending or not self.started:
             return None
         time = self.pending[0].time
-        if time > min(self.end, self.edges_at(), self.control):
+        if time > min(self.end, self.stream_stamp, self.control) or not self._first(self.pending[0]):
             return None
         if any(watermark < time - self.spec.ahead for watermark in self.flow.values()):
             return None
@@ -156,16 +167,30 @@ class Lockstep:
             return False
         return min(self.edges_at(), self.control) >= self.end
 
+    def through(self) -> int:
+        """Return the stamp through which this operator has handled everything; it bounds who waits for it."""
+        return self._reached(self.edges, min((arrival.time for arrival in self.pending[:1]), default=INFINITY))
+
     def watermark(self) -> int:
         """Return the stamp through which this operator has emitted all it ever will."""
+        if not self.silent:
+            return self.through()
+        speaking = [edge for edge in self.edges if edge.port not in self.silent]
+        waiting = (arrival.time for arrival in self.pending if arrival.port not in self.silent)
+        return self._reached(speaking, min(waiting, default=INFINITY))
+
+    def _reached(self, edges: list[_Edge], waiting: int) -> int:
+        """Return how far the operator is with some of its edges. waiting: stamp of what has arrived there first."""
         if self.finished:
             return INFINITY
         if not self.started:
             return -1
         # on_end speaks at the end, which is not known before the operator that ends the run has passed it
-        horizon = min(self.edges_at(), self.end - 1, self.control)
-        if self.pending:
-            return min(horizon, self.pending[0].time - 1)
+        horizon = min(self.stream_stamp, self.end - 1, self.control)
+        for edge in edges:
+            horizon = min(horizon, edge.watermark)
+        if waiting < INFINITY:
+            return min(horizon, waiting - 1)
         if self.streaming and self.spec.end == self.spec.name:
             return min(horizon, self.handled - 1)  # the last item may have been the last: then the run ends at it
         return horizon

@@ -67,7 +67,7 @@ class Node:
     ) -> None:
         self.spec, self.operator, self.incarnation = spec, operator, incarnation
         ports = ports_of(type(operator))
-        self.input_types, self.output_types = ports.inputs, ports.outputs
+        self.input_types, self.output_types, self.silent = ports.inputs, ports.outputs, ports.silent
         self.handlers = {port: getattr(operator, f"on_{port}") for port in ports.inputs}
         self.counts = dict.fromkeys(ports.outputs, 0)
         self.rings = rings or {}  # by output port
@@ -149,7 +149,14 @@ class Node:
         wall_start, begin = time.time_ns(), time.perf_counter_ns()
         emitted: list[Emitted] = []
         ended: str | None = None
-        for item in self._items(call(), port):
+        self.operator.stamp = stamp
+        result = call()
+        if result is not None and port in self.silent:
+            raise OutputError(
+                f"{self.spec.name}: on_{port} is annotated to return None, so nobody waits for what it says; it gave "
+                f"a {type(result).__name__}"
+            )
+        for item in self._items(result, port):
             if isinstance(item, End):
                 ended = item.reason
                 continue

@@ -21,6 +21,7 @@ class Input(msgspec.Struct, frozen=True):
     delay: int = 0  # nanoseconds
     queue: int | Literal["latest"] = 10
     period: int | None = None  # nanoseconds, of a timer
+    silent: bool = False  # nothing is ever emitted when something arrives here
 
 
 class NodeSpec(msgspec.Struct, frozen=True):
@@ -63,7 +64,8 @@ def wire(graph: Graph) -> list[NodeSpec]:
                 continue
             topic = f"{edge.operator}/{edge.port}"
             index = 0 if edge.operator == TIMER else list(ports[edge.operator].outputs).index(edge.port)
-            inputs.append(Input(port, topic, edge.operator, index, edge.delay, edge.queue, edge.period))
+            silent = port in ports[name].silent
+            inputs.append(Input(port, topic, edge.operator, index, edge.delay, edge.queue, edge.period, silent))
         outputs = tuple(ports[name].outputs)
         record = {
             port: entry.record if isinstance(entry.record, str) else entry.record.get(port, "full") for port in outputs

@@ -175,7 +175,7 @@ class Worker:
     def emit(self, emission: Emission) -> None:
         """Put a message on the wire, and remember it for the shard.
 
-        In lockstep nobody may handle it before this call's mark has come, so it waits for that and they travel as one.
+        In lockstep most wait with it until this call's mark has come, so it waits for that, too: they travel as one.
         Where the run goes on after this process was killed, the shard comes first: else nobody could replay the others.
         """
         if self.lockstep is None and self.spec.restart == "on-failure":
@@ -201,13 +201,12 @@ class Worker:
         told = b"" if mark is None else msgspec.msgpack.encode(mark)
         for emission in self.emissions:
             self._put(emission, told)
-        if mark is None:
-            return
-        if not any(emission.port in self.spec.heard for emission in self.emissions):
+        if told and not any(emission.port in self.spec.heard for emission in self.emissions):
             self.wire.put(f"mark/{self.spec.name}", told)
-        if mark.watermark >= self.flowed + self.spec.ahead // FLOW_PARTS:
-            self.flowed = mark.watermark
-            self.wire.put(f"flow/{self.spec.name}", b"", (0, 0, mark.watermark))
+        through = self.lockstep.through()
+        if through >= self.flowed + self.spec.ahead // FLOW_PARTS and through > self.flowed:
+            self.flowed = through
+            self.wire.put(f"flow/{self.spec.name}", b"", (0, 0, through))
 
     def after(self, step: Step) -> None:
         """Promise, then write what the call did into the shard."""

@@ -7,7 +7,8 @@ simulator:
   config: {building: sim/buildings/default.yaml, scenario: easy, tour: A, seed: 1}
 
 The robot is put at the start pose of its tour and knows it: odometry begins at world_from_base of the first tick, so
-that a localizer without a map builds one in the world's frame. Frames are stamped with the end of their scan.
+that a localizer without a map builds one in the world's frame. Frames are stamped with the end of their scan. What
+arrives with a tick comes after it: the scan of that moment does not depend on it, and need not wait for it.
 """
 
 from __future__ import annotations
@@ -70,8 +71,8 @@ class Simulator(Operator):
             odometry=c.odometry,
         )
         self.referee = Referee(self.world.targets, self.world.length, patience=c.patience, radius=c.goal_radius)
-        self.command = (0.0, 0.0)  # in force since the last tick
-        self.coming = (0.0, 0.0)  # in force from the next tick on
+        self.command = (0.0, 0.0)  # in force at the last tick
+        self.orders: list[tuple[float, float, float]] = []  # that came since: seconds after it, m/s, rad/s
         self.asked = (0, 0)  # index of the target asked for, and since which stamp
         self.now: int | None = None  # stamp of the last tick
         self.poses: dict[int, Matrix] = {}  # true world_from_base by stamp, for estimates still to come
@@ -79,22 +80,6 @@ class Simulator(Operator):
     @classmethod
     def warm_up(cls) -> None:
         rehearse()
-
-    def on_drive(self, drive: Drive) -> None:
-        """Obey from the next tick on: what it moves is seen at the tick after that."""
-        self.coming = (drive.linear, drive.angular)
-
-    def on_pose(self, pose: Pose) -> None:
-        """Judge what the robot believes against the truth of the same moment."""
-        true = self.poses.get(pose.measured_at)
-        if true is not None:
-            self.referee.judge(pose.world_from_base, true)
-
-    def on_plan(self, plan: Plan | None) -> None:
-        """Go on with the next target once the planner, knowing of the present one, calls it unreachable."""
-        assert plan is not None
-        if plan.status == "unreachable" and plan.measured_at >= self.asked[1]:
-            self.referee.skip()
 
     def on_tick(self, tick: Tick) -> Iterator[Outputs | End]:
         """Advance to the tick, scan, and say whether the tour goes on. Raises ValueError at a tick of another rate."""
@@ -106,8 +91,10 @@ class Simulator(Operator):
                 raise ValueError(
                     f"simulator.tick came after {seconds:g} s; the lidar wants timer/{world.spec.rate:g}hz"
                 )
-            world.advance(*self.command, seconds)
-        self.now, self.command = now, self.coming
+            world.advance(*self.command, seconds, self.orders)
+        if self.orders:
+            self.command = self.orders[-1][1:]
+        self.now, self.orders = now, []
         state = world.state()
         self.poses = {stamp: pose for stamp, pose in self.poses.items() if stamp > now - REMEMBERED}
         self.poses[now] = state.world_from_base
@@ -143,6 +130,23 @@ class Simulator(Operator):
         )
         if verdict:
             yield End(verdict)
+
+    def on_drive(self, drive: Drive) -> None:
+        """Obey from now on, which is seen at the next tick."""
+        since = 0.0 if self.now is None else max(0.0, (self.stamp - self.now) / SECOND)
+        self.orders.append((since, drive.linear, drive.angular))
+
+    def on_pose(self, pose: Pose) -> None:
+        """Judge what the robot believes against the truth of the same moment."""
+        true = self.poses.get(pose.measured_at)
+        if true is not None:
+            self.referee.judge(pose.world_from_base, true)
+
+    def on_plan(self, plan: Plan | None) -> None:
+        """Go on with the next target once the planner, knowing of the present one, calls it unreachable."""
+        assert plan is not None
+        if plan.status == "unreachable" and plan.measured_at >= self.asked[1]:
+            self.referee.skip()
 
     def goal(self, now: int) -> Goal:
         """Name the target to reach next, after the tour the last one."""

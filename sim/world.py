@@ -7,6 +7,7 @@ frame = world.step(linear=0.5, angular=0.0)  # or world.step(drive) with a Drive
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -203,19 +204,32 @@ class World:
         self.crowd.advance(seconds, self.free, robot, with_robot)
         self.capsules = self._capsules()
 
-    def advance(self, linear: float, angular: float, seconds: float = 0.1) -> None:
-        """Let people walk and the robot drive for a while."""
+    def advance(
+        self,
+        linear: float,
+        angular: float,
+        seconds: float = 0.1,
+        orders: Sequence[tuple[float, float, float]] = (),
+    ) -> None:
+        """Let people walk and the robot drive for a while.
+
+        orders: commands that come meanwhile, in their order: seconds from now, m/s, rad/s.
+        """
         base = self.motion.world_from_base
         self.walk(seconds)
         self.physics.drive(linear, angular)
         self.trail = [base]
         touched: set[int] = set()
+        given = 0
         substeps = round((self.time + seconds) / SUBSTEP) - round(self.time / SUBSTEP)
         glides = max(1, round(substeps / GLIDE))
         for glide in range(glides):
             share = (glide + 1) / glides
             self.physics.place_people(self.bodies_before * (1.0 - share) + self.capsules * share, self.radii)
-            for _ in range(glide * substeps // glides, (glide + 1) * substeps // glides):
+            for substep in range(glide * substeps // glides, (glide + 1) * substeps // glides):
+                while given < len(orders) and orders[given][0] * substeps <= substep * seconds:
+                    self.physics.drive(*orders[given][1:])
+                    given += 1
                 self.physics.step()
                 still, people = self.physics.contacts()
                 touched |= {1 + body for body in still} | {len(self.bodies) + person for person in people}

@@ -82,11 +82,12 @@ def _mixer(draw: st.DrawFn, names: list[str], index: int, ending: str | None) ->
         least = 1 if producer >= index or name == ending else 0
         delay = draw(st.integers(least, 9)) if least or draw(st.booleans()) else 0
         inputs[port] = Edge(names[producer], draw(st.sampled_from("xy")), delay)
+    kind = draw(st.sampled_from(["Mixer", "Mixer", "Listener"]))
     for port, periods in (("slow", [4, 5, 7]), ("fast", [1, 2, 3])):
         needed = port == "slow" and (not inputs or name == ending)  # else it might never be called
         if needed or draw(st.integers(0, 2)) == 0:
             inputs[port] = Edge("timer", f"{draw(st.sampled_from(periods))}ns", draw(st.sampled_from([0, 0, 2])))
-    return OperatorEntry(f"{TRIALS}:Mixer", inputs, _config(draw, name == ending))
+    return OperatorEntry(f"{TRIALS}:{kind}", inputs, _config(draw, name == ending))
 
 
 # the twin: one heap, one thread
@@ -221,16 +222,17 @@ class Network:
 
     def promise(self, station: Station) -> bool:
         name = station.spec.name
-        if (mark := station.schedule.news(tuple(station.node.counts.values()))) is None:
-            return False
-        for other in self.stations.values():
-            if name in other.spec.producers or other.spec.end == name:
-                self.send(name, other.spec.name, "mark", mark)
-        if mark.watermark >= station.flowed + station.spec.ahead // FLOW_PARTS:
-            station.flowed = mark.watermark
+        mark, through = station.schedule.news(tuple(station.node.counts.values())), station.schedule.through()
+        if mark is not None:
+            for other in self.stations.values():
+                if name in other.spec.producers or other.spec.end == name:
+                    self.send(name, other.spec.name, "mark", mark)
+        flows = through > station.flowed and through >= station.flowed + station.spec.ahead // FLOW_PARTS
+        if flows:
+            station.flowed = through
             for producer in station.spec.producers:
-                self.send(name, producer, "flow", mark.watermark)
-        return True
+                self.send(name, producer, "flow", through)
+        return mark is not None or flows
 
     def act(self, station: Station) -> bool:
         """Let a station do one thing; say whether there was one."""
@@ -269,7 +271,7 @@ class Network:
         """Hold an operator against the flow rule: each consumer is complete through time - ahead."""
         for name in station.spec.consumers:
             if name != station.spec.name:
-                lead = time - self.stations[name].schedule.watermark()
+                lead = time - self.stations[name].schedule.through()
                 assert lead <= station.spec.ahead, f"{station.spec.name} is {lead} ns ahead of {name}"
 
     def run(self) -> dict[str, list[Step]]:

@@ -166,3 +166,33 @@ def test_a_source_that_a_person_stopped_is_asked_no_more() -> None:
     schedule.offer(15)
     assert [arrival.time for arrival in _drained(schedule)] == [10]
     assert schedule.complete()
+
+
+def test_an_arrival_waits_only_for_what_may_come_before_it() -> None:
+    graph = _graph(
+        Clock(duration=100),
+        one=_mix({"slow": Edge("timer", "5ns")}),
+        both=_mix({"slow": Edge("timer", "5ns", 5), "a": Edge("one", "x", 5), "fast": Edge("timer", "1ns", 10)}),
+    )
+    schedule = Lockstep(wire(graph)[1])
+    schedule.started = True
+    ports = [edge.port for edge in schedule.spec.inputs]
+    assert ports == ["slow", "a", "fast"]
+    for watermark, due in ((-1, [(5, "slow")]), (3, []), (4, [(10, "slow")]), (5, [(10, "fast")])):
+        schedule.mark("one", Mark(watermark, (0, 0)))  # what a may still bring comes 5 ns after that, and after `slow`
+        assert [(arrival.time, ports[arrival.port]) for arrival in _drained(schedule)] == due
+
+
+def test_what_is_only_listened_to_holds_up_no_promise_but_those_who_run_ahead() -> None:
+    graph = _graph(
+        Clock(duration=100),
+        one=_mix({"slow": Edge("timer", "5ns")}),
+        both=OperatorEntry(
+            f"{TRIALS}:Listener", {"slow": Edge("timer", "5ns"), "a": Edge("one", "x", 2)}, {"share": 100}
+        ),
+    )
+    schedule = Lockstep(wire(graph)[1])
+    schedule.started = True
+    schedule.mark("one", Mark(0, (0, 0)))
+    assert [arrival.time for arrival in _drained(schedule)] == [0]
+    assert (schedule.watermark(), schedule.through()) == (4, 2)

@@ -241,3 +241,25 @@ def test_a_method_that_is_no_port_is_refused_by_name() -> None:
         ports_of(Untyped)
     with pytest.raises(ContractError, match=r"Plain\.on_count wants one message type"):
         ports_of(Plain)
+
+
+class Listening(Saying):
+    """A Saying that promises to say nothing at one port."""
+
+    def on_count(self, count: Count) -> None:
+        self.heard.append((count.value, self.stamp))
+        return self.said  # type: ignore[no-any-return]
+
+
+def test_a_method_annotated_to_return_none_is_held_to_it() -> None:
+    assert ports_of(Listening).silent == {"count"}
+    assert ports_of(Saying).silent == frozenset()
+    for said, complaint in ((None, None), (both(1, None), "Two"), (End(), "End")):
+        node = node_of(Listening(said))
+        arrival = Arrival(50, 0, 0, 0, encode(count(7)))
+        if complaint is None:
+            assert node.handle(arrival, 50, lambda emission: None).emitted == ()
+            assert node.operator.heard == [(7, 50)]  # type: ignore[attr-defined]
+            continue
+        with pytest.raises(OutputError, match=f"trial: on_count is annotated to return None.* it gave a {complaint}"):
+            node.handle(arrival, 50, lambda emission: None)

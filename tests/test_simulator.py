@@ -18,6 +18,7 @@ from graph.messages import Drive, Goal, Odometry, Plan, PointCloud, Pose, Tick, 
 from graph.node import build_operator
 from graph.wiring import wire
 from operators.simulator import Simulator
+from sim.physics import ACCELERATION
 
 STEP = 100_000_000  # nanoseconds
 
@@ -59,7 +60,7 @@ def tick(simulator: Simulator, index: int) -> tuple[Simulator.Outputs, str]:
 
 def test_ports_and_their_order() -> None:
     ports = ports_of(Simulator)
-    assert list(ports.inputs) == ["drive", "pose", "plan", "tick"]
+    assert list(ports.inputs) == ["tick", "drive", "pose", "plan"]
     assert ports.outputs == {"frame": PointCloud, "odometry": Odometry, "goal": Goal, "truth": Truth}
 
 
@@ -136,7 +137,8 @@ def test_it_drives_until_the_tour_is_finished(files: tuple[Path, str]) -> None:
     msgspec.json.encode(summary)
 
 
-def test_a_command_moves_nothing_before_it_came(files: tuple[Path, str]) -> None:
+@pytest.mark.parametrize("share", [0, 50, 75, 100])
+def test_a_command_moves_nothing_before_it_came(files: tuple[Path, str], share: int) -> None:
     simulator = make(files)
 
     def x(index: int) -> float:
@@ -145,10 +147,12 @@ def test_a_command_moves_nothing_before_it_came(files: tuple[Path, str]) -> None
         return float(said.truth.world_from_base[0, 3])
 
     before = [x(0), x(1)]
-    simulator.on_drive(Drive(measured_at=STEP, linear=1.0, angular=0.0))  # 100 ms later, with the next tick
-    at, after = x(2), x(3)
-    assert at - before[1] == pytest.approx(0.0, abs=1e-4)
-    assert after - at > 0.003
+    simulator.stamp = STEP + share * STEP // 100  # when it arrives: a share of the period after the last tick
+    simulator.on_drive(Drive(measured_at=0, linear=1.0, angular=0.0))
+    after = x(2) - before[1]
+    driven = (1.0 - share / 100) * STEP * 1e-9  # seconds
+    assert after == pytest.approx(0.5 * ACCELERATION * driven**2, abs=2e-3 * (driven > 0) + 1e-4)
+    assert x(3) - before[1] > after + 0.003
 
 
 def test_a_pose_is_judged_against_its_own_moment(files: tuple[Path, str]) -> None:

@@ -95,6 +95,22 @@ class Mixer(_Mixing, Operator):
         return self.mix(6, count.value)
 
 
+class Listener(Mixer):
+    """A Mixer that only listens at three of its ports."""
+
+    def on_a(self, count: Count | None) -> None:
+        self.hear(2, count.value)
+
+    def on_fast(self, tick: Tick | None) -> None:
+        self.hear(4, tick.index)
+
+    def on_d(self, count: Count | None) -> None:
+        self.hear(6, count.value)
+
+    def hear(self, number: int, value: int) -> None:
+        self.state = (self.state * 29 + number * 5 + value) % MODULUS
+
+
 class MixerSource(_Mixing, Source):
     """Say mixed numbers at given stamps."""
 
