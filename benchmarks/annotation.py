@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.pointmap import drive, row, whole_map
 from operators.annotation.acceptance import gather_evidence
 from operators.annotation.buffer import Classing, classify, known_map, new_points, trace_new
-from operators.annotation.first_map import thinned
+from operators.annotation.first_map import without_doubles
 from operators.annotation.growing import GrowingBuffer
 from operators.annotation.projection import Projector
 from operators.annotation.refinement import refine, trace_map
@@ -99,7 +99,7 @@ def live(initial: MapPoints, session: Kept) -> float:
 def rows() -> list[dict[str, Any]]:
     """Measure a drive through the whole building's map."""
     cloud = whole_map(seed=101)
-    initial = cloud.kept(thinned(cloud, 0.03))
+    initial = cloud.kept(without_doubles(cloud, 0.03))
     record = drive("A", seed=21, count=FRAMES)
     scans = [
         Scan(points, pose @ record.base_from_lidar)

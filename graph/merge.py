@@ -210,7 +210,7 @@ def merge(
         _register_silent(writer, readers, targets)
         end = max(end_stamps) if end_stamps else last
         accounts = ledger.accounts(end if end < INFINITY else last)
-        why = [*reasons, *_shortcomings(by_name, ended, ledger, accounts)]
+        why = list(dict.fromkeys([*reasons, *_shortcomings(by_name, ended, ledger, accounts)]))
         for log in logs:
             if text := log.read_bytes():
                 writer.add_attachment(0, 0, f"log/{log.stem}.txt", "text/plain", text)

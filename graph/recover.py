@@ -16,7 +16,7 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import Writer
 
 from graph.merge import merge
-from graph.recording import MAGIC, RUN, Channels, RecordingError, Run, Verdict, unseal
+from graph.recording import MAGIC, RUN, VERDICT, Channels, RecordingError, Run, Verdict, unseal
 from graph.run import run_of
 
 
@@ -69,8 +69,11 @@ def _recover_file(source: Path, out: Path) -> Recovery:
             raise RecordingError(f"{source}: its {RUN} record is gone, and with it the graph; nothing can be recovered")
         if not shards:
             raise RecordingError(f"{source}: not one whole chunk is left")
-        reasons = ["recovered from a damaged file", *scan.lost]
-        verdict = merge(shards, out, scan.run, reasons=reasons)
+        was = scan.verdict
+        if scan.lost or was is None:
+            verdict = merge(shards, out, scan.run, reasons=["recovered from a damaged file", *scan.lost])
+        else:
+            verdict = merge(shards, out, scan.run, reasons=was.reasons, wall_seconds=was.wall_seconds)
     return Recovery(verdict, verdict.messages, scan.chunks, scan.lost)
 
 
@@ -80,6 +83,7 @@ class _Scan:
     def __init__(self, data: mmap.mmap) -> None:
         self.file, self.data = data, memoryview(data)
         self.run: Run | None = None
+        self.verdict: Verdict | None = None
         self.chunks = 0
         self.lost: list[str] = []
         self.channels = Channels()
@@ -168,6 +172,8 @@ class _Scan:
             record = Metadata.read(_stream(content))
             if record.name == RUN:
                 self.run = unseal(record.metadata, Run, RUN)
+            elif record.name == VERDICT:
+                self.verdict = unseal(record.metadata, Verdict, VERDICT)
         except Exception as error:  # any byte may have changed
             self.lost.append(f"the metadata at byte {place}: {error}")
 

@@ -248,3 +248,18 @@ def test_a_full_disk_leaves_no_recording_behind(building, monkeypatch, capsys):
     assert not list((building / "out_full").glob("*.mcap"))
     monkeypatch.undo()
     assert main(["annotate", *arguments, "--quiet"]) == 0
+
+
+def test_a_map_is_thinned(building, tmp_path, capsys):
+    few = tmp_path / "few.ply.gz"
+    assert main(["map", str(building / "map.ply"), "--thin", "0.1", "-o", str(few), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    whole, made = load_map(building / "map.ply"), load_map(few)
+    assert (told["points"], told["of"]) == (len(made.points), len(whole.points))
+    assert 0.02 * len(whole.points) < len(made.points) < 0.5 * len(whole.points)
+    assert main(["map", str(building / "map.ply"), "-o", str(few)]) == 2
+    assert "is a map already; --thin 0.1 makes a smaller one of it" in capsys.readouterr().err
+    assert main(["map", str(building / "map.ply"), "--thin", "2", "-o", str(few)]) == 2
+    assert "--thin wants metres from --voxel to 1; it was given 2" in capsys.readouterr().err
+    assert main(["map", str(building / "gone.ply"), "--thin", "0.1", "-o", str(few)]) == 2
+    assert "no such map" in capsys.readouterr().err

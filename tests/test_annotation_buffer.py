@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from operators.annotation.acceptance import Acceptance, Evidence, judge, targets_reached
 from operators.annotation.buffer import Classing, classify, known_map, pooled
-from operators.annotation.first_map import thinned
+from operators.annotation.first_map import without_doubles
 from operators.annotation.floor import floor_points
 from operators.annotation.projection import Projector
 from operators.annotation.refinement import Refinement, refine, seen_through, walls_of
@@ -166,13 +166,13 @@ def test_the_short_cut_of_the_projection_changes_nothing(seed):
     np.testing.assert_array_equal(Projector(buffer).project(scan), Projector(buffer._replace(apart=0.0)).project(scan))
 
 
-def test_a_thinned_map_has_one_point_a_voxel_on_both_grids():
+def test_a_map_without_doubles_has_one_point_a_voxel_on_both_grids():
     rng = np.random.default_rng(0)
     points = (rng.uniform(-1.0, 1.0, (20_000, 3)) * (1.0, 1.0, 0.02)).astype(np.float32)
     voxels = VoxelMap()
     voxels.insert(points, np.zeros_like(points), rng.random(20_000).astype(np.float32), 0)
     cloud = voxels.cloud()
-    kept = cloud.kept(thinned(cloud, 0.03))
+    kept = cloud.kept(without_doubles(cloud, 0.03))
     assert len(kept.points) < 0.8 * len(cloud.points)
     for shift in (0.0, 0.015):
         cells = np.floor((kept.points.astype(np.float64) + shift) / 0.03)

@@ -120,6 +120,9 @@ def test_nothing_to_recover_is_said_by_name(record: Record, tmp_path: Path) -> N
 
 def test_a_whole_recording_recovers_whole(record: Record, tmp_path: Path) -> None:
     recording = record()
-    recover(recording.path, tmp_path / "out.mcap")
-    assert list(Recording(tmp_path / "out.mcap").entries()) == list(recording.entries())
+    recovery = recover(recording.path, tmp_path / "out.mcap")
+    again = Recording(tmp_path / "out.mcap")
+    assert list(again.entries()) == list(recording.entries())
+    assert (recovery.lost, again.verdict) == ([], recording.verdict)
+    assert again.verdict.verdict == "COMPLETE"
     assert {STEP, SUMMARY} == {"step", "summary"}

@@ -78,7 +78,7 @@ def first_map(
     found, _ = pointmap.map.nearest(cloud.points, REACH)
     movable_again = np.where(found >= 0, movable[found], np.float32(0.5)).astype(np.float32)
     chosen = np.flatnonzero(movable_again <= threshold)
-    chosen = chosen[thinned(cloud.kept(chosen), again.map.voxel_size)]
+    chosen = chosen[without_doubles(cloud.kept(chosen), again.map.voxel_size)]
     cloud = cloud.kept(chosen)._replace(movable=movable_again[chosen])
     labels = np.full(len(cloud.points), PERMANENT, np.uint8)
     plane = find_ground(cloud.points, cloud.normals)
@@ -93,7 +93,7 @@ def first_map(
     )
 
 
-def thinned(cloud: MapPoints, voxel: float) -> npt.NDArray[np.int64]:
+def without_doubles(cloud: MapPoints, voxel: float) -> npt.NDArray[np.int64]:
     """Return which points of a map to keep (k,), neighbours in space beside each other: one in each shifted voxel too.
 
     A floor at height 0 lies on the border of two layers of voxels and fills both: half of a building's points say
