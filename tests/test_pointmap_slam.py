@@ -11,8 +11,8 @@ from test_pointmap_room import BASE_FROM_LIDAR, BOXES, scan
 from graph.geometry import exponential, inverse, planar, rotation_angle, transform, yaw
 from operators.pointmap import Criteria, PointMap, Settings
 from operators.pointmap.draw import alias_table, generator, sample, uniform
-from operators.pointmap.icp import mean_pose, solve, turned
-from operators.pointmap.slam import leveled
+from operators.pointmap.icp import Alignment, mean_pose, solve, turned
+from operators.pointmap.slam import leveled, misfit
 
 
 def error_of(world_from_lidar, truth):
@@ -246,3 +246,11 @@ def test_wheels_that_slip_neither_move_the_robot_nor_spoil_the_map(slip):
         assert track.added == 0
         assert len(pointmap.map) == before
     assert pointmap.track(scan(pose), pose @ planar(0.01, 0.0, 0.0)).added > 0
+
+
+def test_the_wrong_face_of_a_wall_fits_worse_however_close_its_planes_are():
+    wrong = Alignment(np.eye(4), True, 11, 0.935, 0.0050)  # as both were measured when wheels slipped by 0.12 m
+    right = Alignment(np.eye(4), True, 11, 0.998, 0.0052)
+    assert misfit(right, 0.08) < misfit(wrong, 0.08)
+    assert misfit(right._replace(inliers=1.0), 0.08) == pytest.approx(0.0052**2)
+    assert misfit(right._replace(inliers=0.0), 0.08) == pytest.approx(0.08**2)

@@ -46,6 +46,14 @@ class Track(NamedTuple):
     added: int  # new points of the map
 
 
+def misfit(result: Alignment, reach: float) -> float:
+    """Return the mean squared distance of the samples from their planes, m^2; `reach` metres for those that have none.
+
+    On the wrong face of a wall what lies on walls fits as well as on the right one; what else there is has no plane.
+    """
+    return result.inliers * result.residual**2 + (1.0 - result.inliers) * reach**2
+
+
 def leveled(world_from_base: Pose, share: float) -> Pose:
     """Return a pose (4, 4) that has given up a share (0 to 1) of its height and of its tilt; x, y and yaw stay."""
     flat = planar(world_from_base[0, 3], world_from_base[1, 3], yaw(world_from_base))
@@ -124,7 +132,8 @@ class PointMap:
         still = guess.copy()
         still[:3, 3] = last[:3, 3]
         other = align(self.map.store, self.map.voxel_size, frame, still, self.settings.criteria, state)
-        if other.converged and (not found.converged or other.residual < found.residual):
+        reach = self.settings.criteria.final_reach
+        if other.converged and (not found.converged or misfit(other, reach) < misfit(found, reach)):
             return other
         return found
 
