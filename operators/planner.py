@@ -2,8 +2,8 @@
 
 planner:
   run: operators.planner:Planner
-  inputs: {goal: simulator/goal, map: localizer/occupancy, obstacles: triage/planning, tracks: tracker/tracks,
-    pose: localizer/pose}
+  inputs: {goal: simulator/goal, map: localizer/occupancy, obstacles: triage/planning, people: triage/people,
+    tracks: tracker/tracks, pose: localizer/pose}
   config: {people: predict}
 """
 
@@ -71,6 +71,7 @@ class Planner(Operator):
         )
         self._poses: deque[tuple[int, Matrix]] = deque(maxlen=HISTORY)
         self._frames: deque[PointCloud] = deque(maxlen=WAITING)
+        self._people: deque[PointCloud] = deque(maxlen=WAITING)
         self._tracks: Tracks | None = None
         self._presence = Presence()
 
@@ -105,6 +106,10 @@ class Planner(Operator):
     def on_obstacles(self, frame: PointCloud) -> None:
         self._frames.append(frame)
 
+    def on_people(self, people: PointCloud | None) -> None:
+        assert people is not None
+        self._people.append(people)
+
     def on_tracks(self, tracks: Tracks | None) -> None:
         self._tracks = tracks
 
@@ -117,7 +122,10 @@ class Planner(Operator):
                 self.navigator.observe(frame.points, where, frame.base_from_lidar)
                 if self.config.people == "predict":
                     things = self.navigator.costmap.standing(float(where[0, 3]), float(where[1, 3]), BLIND)
-                    self._presence.observe(frame.points, where @ frame.base_from_lidar, things)
+                    people = [other.points for other in self._people if other.measured_at == frame.measured_at]
+                    if people or frame.label is None:  # else nobody knows which rays people gave back
+                        points = np.concatenate([frame.points, *people])
+                        self._presence.observe(points, where @ frame.base_from_lidar, things)
         if self.config.people == "predict":
             self.navigator.meet(self._walkers(pose.measured_at))
         decision = self.navigator.step(pose.measured_at, pose.world_from_base, valid=pose.valid)

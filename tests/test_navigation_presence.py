@@ -55,7 +55,7 @@ def test_who_walks_around_the_robot_moves_with_the_shadow():
 
 
 def test_who_is_seen_is_where_it_is_seen():
-    company = meet(Presence(), [walls((0.0, 0.2))] * 3, unseen=0.0, steps=3)
+    company = meet(Presence(), [walls()] * 3, unseen=0.0, steps=3)
     assert np.array_equal(company, [[0.75, 0.0, 0.1, 0.0]])
 
 
@@ -70,7 +70,7 @@ def test_shadow_that_nothing_explains_is_somebody():
     company = meet(Presence(), frames, steps=0)
     assert len(company) == 1
     assert abs(math.atan2(company[0, 1], company[0, 0]) - 1.0) < 0.06
-    assert len(meet(Presence(), frames, steps=0, things=(0.4, 0.6))) == 0
+    assert len(meet(Presence(), frames, steps=0, things=[(0.4, 0.5), (0.4, 0.6), (0.4, 0.7), (0.4, 0.8)])) == 0
     assert len(meet(Presence(), frames[:NOTICED], steps=0)) == 0
 
 
@@ -122,3 +122,18 @@ def test_gaps_cover_runs_of_two_and_more(flags):
         covered |= np.abs((off + math.pi) % (2.0 * math.pi) - math.pi) < half
     lonely = ~passed & np.roll(passed, 1) & np.roll(passed, -1)
     assert np.array_equal(covered, ~passed & ~lonely)
+
+
+def test_wide_shadow_is_that_of_some_people_side_by_side():
+    company = meet(Presence(), [walls((1.0, 0.6))] * (NOTICED + 1), steps=0)
+    assert len(company) == 2
+    bearing = np.sort(np.arctan2(company[:, 1], company[:, 0]))
+    assert np.allclose(bearing, [0.7, 1.3], atol=0.1)
+    assert len(meet(Presence(), [walls((1.0, 1.5))] * (NOTICED + 1), steps=0)) == 0  # the lidar does not look there
+
+
+def test_rays_between_the_legs_say_nothing_of_the_trunk():
+    low = walls()
+    low[:, 2] = -4.0 * 0.64 / 1.2  # they hit the floor behind somebody
+    frames = [np.concatenate([walls((1.0, 0.2)), low])] * (NOTICED + 1)
+    assert len(meet(Presence(), frames, steps=0)) == 1

@@ -2,7 +2,7 @@
 
 Nearer than 0.9 m the lidar is blind, but rays that somebody swallows return nothing: in a building every direction has
 an echo, or something near has taken it. Whoever was followed into the ring is there as long as such a gap is, and moves
-with it; where rays pass, nobody stands.
+with it; where rays at the height of a trunk return from farther away, nobody stands.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ SECTORS = 120  # of 3 degrees: a thigh at arm's length is twice as wide
 BLIND = 1.15  # metres from the lidar: nearer, some or all of a person has no echo
 LEAST, MOST = 0.6, 0.78  # metres at which somebody stands who has just gone where nothing tells how near
 SEEN = 0.15  # seconds: who was seen in the last frame or so
-HALF_WIDTH = 0.1  # metres, of what is surely seen of a person
 ASIDE = math.radians(30.0)  # that a gap may have moved since the last frame but some
 NARROW = math.radians(60.0)  # a wider gap is that of a wall or a table
 SHADOW = math.radians(9.0)  # half of a person's
@@ -30,9 +29,12 @@ FOLLOWING = 0.5  # share of the way into a gap by which a frame moves somebody
 DOUBTS = 5  # frames without a gap after which nobody is there
 MEMORY = 50  # frames for which a wide gap, of a wall or a table, may hide somebody
 REST, RECEDING = 0.72, 0.4  # metres to which people step back, and the share of the missing way in a frame
-STRANGER = math.radians(5.0), math.radians(22.0)  # half a gap that nothing else explains: somebody's, whoever it is
-NOTICED = 3  # frames of such a gap after which it counts
+STRANGER = math.radians(5.0), math.radians(22.0)  # half a gap that nothing explains: somebody's; wider, some people's
+NOWHERE = math.radians(75.0)  # half a gap where the lidar does not look at all
+NOTICED = 2  # frames of such a gap after which it counts
 ONE = 0.25  # metres: two nearer to each other are one
+TRUNK = 0.45, 1.4  # metres above the floor: lower, rays pass between the legs
+BREADTH = 0.25  # metres: half of what somebody hides
 
 
 class Hidden(NamedTuple):
@@ -74,11 +76,16 @@ class Presence:
         self._eye = (0.0, 0.0)
 
     def observe(self, points: npt.NDArray[np.float32], world_from_lidar: Floats, things: Floats) -> None:
-        """Take in what a frame shows of all that is not people: points (n, 3) in the lidar frame.
+        """Take in what a frame shows, people too: points (n, 3) in the lidar frame.
 
         things: places (m, 2) of what is known to stand in the ring, in the world: it swallows rays, too.
         """
-        x, y = points[:, 0].astype(np.float64), points[:, 1].astype(np.float64)
+        x, y, z = points.astype(np.float64).T
+        height = (
+            world_from_lidar[2, 3] + z / np.maximum(np.hypot(x, y), 1e-6) * REST
+        )  # of the ray where somebody stands
+        trunk = (height > TRUNK[0]) & (height < TRUNK[1])
+        x, y = x[trunk], y[trunk]
         bearing = np.arctan2(y, x) + math.atan2(world_from_lidar[1, 0], world_from_lidar[0, 0])
         sector = np.floor(bearing * (SECTORS / (2.0 * math.pi))).astype(np.int64) % SECTORS
         self._passed = np.bincount(sector, minlength=SECTORS) > 0
@@ -95,33 +102,24 @@ class Presence:
         eye = np.array(self._eye)
         offset = walkers[:, :2] - eye
         away = np.hypot(offset[:, 0], offset[:, 1])
-        bearing = np.arctan2(offset[:, 1], offset[:, 0])
         seen = unseen < SEEN
-        passed = self._passed.copy()
-        for index in np.flatnonzero(seen & (away > 0.5 * BLIND)):  # their echoes came back, too
-            half = math.atan2(HALF_WIDTH, float(away[index]))
-            reach = int(half * SECTORS / (2.0 * math.pi))
-            middle = math.floor(bearing[index] * (SECTORS / (2.0 * math.pi)))
-            passed[np.arange(middle - reach, middle + reach + 1) % SECTORS] = True
         known = {person.identity for person in self.hidden}
         for index in np.flatnonzero(~seen & (away < BLIND)):
             if int(identity[index]) not in known:
                 share = min(max(float(away[index]), LEAST), MOST) / max(float(away[index]), 1e-6)
                 x, y = eye + share * offset[index]
                 self.hidden.append(Hidden(int(identity[index]), float(x), float(y), 0, 0))
-        visible = np.flatnonzero(seen)
-        empty = gaps(passed)
-        self.hidden = self._looked_for(empty, set(identity[visible].tolist()), walkers[visible, :2])
-        self._notice(empty)
+        self.hidden = self._looked_for(gaps(self._passed), set(identity[seen].tolist()))
+        self._notice()
         known_ones = [one for one in self.hidden if one.identity >= 0 or one.frames >= NOTICED]
         still = np.array([[one.x, one.y, 0.0, 0.0] for one in known_ones]).reshape(-1, 4)
         return np.concatenate([walkers[seen | (away >= BLIND)], still])
 
-    def _looked_for(self, empty: list[tuple[float, float]], again: set[int], visible: Floats) -> list[Hidden]:
-        """Move the hidden to their gaps; let go of those seen elsewhere, looked through, or one with another."""
+    def _looked_for(self, empty: list[tuple[float, float]], again: set[int]) -> list[Hidden]:
+        """Move the hidden to their gaps; let go of those looked through, seen at once, or one with another."""
         kept: list[Hidden] = []
         for person in self.hidden:
-            if person.identity in again:
+            if person.identity in again and person.frames == 0:
                 continue
             x, y = person.x - self._eye[0], person.y - self._eye[1]
             away, bearing = math.hypot(x, y), math.atan2(y, x)
@@ -138,25 +136,24 @@ class Presence:
                 doubts = person.doubts + 1
             away += max(0.0, RECEDING * (REST - away))
             place = self._eye[0] + away * math.cos(bearing), self._eye[1] + away * math.sin(bearing)
-            others = [*visible.tolist(), *((other.x, other.y) for other in kept)]
-            if doubts < DOUBTS and all(math.dist(place, other) > ONE for other in others):
+            if doubts < DOUBTS and all(math.dist(place, (other.x, other.y)) > ONE for other in kept):
                 kept.append(Hidden(person.identity, *place, doubts, person.frames + 1))
         return kept
 
-    def _notice(self, empty: list[tuple[float, float]]) -> None:
-        """Suspect somebody in each narrow gap in which nobody is believed, and that no thing explains."""
-        for middle, half in empty:
-            if not STRANGER[0] <= half <= STRANGER[1]:
+    def _notice(self) -> None:
+        """Suspect somebody in each direction that no ray passed and that neither a thing nor anybody known explains."""
+        explained = self._passed | self._things | np.roll(self._things, 1) | np.roll(self._things, -1)
+        for one in self.hidden:
+            away, bearing = math.dist((one.x, one.y), self._eye), math.atan2(one.y - self._eye[1], one.x - self._eye[0])
+            half = math.asin(min(1.0, BREADTH / max(away, 1e-6))) * SECTORS / (2.0 * math.pi)
+            middle = bearing * SECTORS / (2.0 * math.pi)
+            explained[np.arange(math.floor(middle - half), math.floor(middle + half) + 1) % SECTORS] = True
+        for middle, half in gaps(explained):
+            if not STRANGER[0] <= half <= NOWHERE:
                 continue
-            x, y = math.cos(middle), math.sin(middle)
-            sectors = np.arange(
-                math.floor((middle - half) * SECTORS / (2.0 * math.pi)),
-                math.floor((middle + half) * SECTORS / (2.0 * math.pi)) + 1,
-            )
-            owned = any(
-                abs(_turn(math.atan2(one.y - self._eye[1], one.x - self._eye[0]), middle)) < half + SHADOW
-                for one in self.hidden
-            )
-            if not owned and not self._things[sectors % SECTORS].any():
+            count = math.ceil(half / STRANGER[1])
+            for index in range(count):
+                bearing = middle + half * ((2 * index + 1) / count - 1.0)
                 self.strangers += 1
-                self.hidden.append(Hidden(-self.strangers, self._eye[0] + REST * x, self._eye[1] + REST * y, 0, 0))
+                x, y = self._eye[0] + REST * math.cos(bearing), self._eye[1] + REST * math.sin(bearing)
+                self.hidden.append(Hidden(-self.strangers, x, y, 0, 0))
