@@ -21,7 +21,7 @@ class Refinement(NamedTuple):
     threshold: float = 0.9  # movable probability; high, for what is missed now will be caught by another session
     tolerance: float = 0.10  # metres; ground never leaves
     clearance: float = 0.10
-    piece: float = 0.2  # share of a flat piece; where so much of it leaves, the rest leaves too
+    piece: float = 0.25  # share of a flat piece; where so much of it leaves, the rest leaves too
     longest: float = 3.0  # metres of such a piece: longer ones are walls
 
 
