@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 
 from graph.errors import UserError
+from graph.lifeline import end_if_bound
 
 # verb: (module with add_arguments and run, one line of help); a string, so that the runtime imports nobody
 DOMAIN = {
@@ -298,6 +299,7 @@ def _load(module: str) -> Any:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one verb. Returns 0 on success only; bad input is one sentence on stderr and 2."""
+    end_if_bound()
     given = sys.argv[1:] if arguments is None else arguments
     verb = next((word for word in given if not word.startswith("-")), None)
     try:

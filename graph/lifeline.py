@@ -1,4 +1,4 @@
-"""What ties the process of an operator to its launcher: the pipe at its stdin."""
+"""What ties a process to the one that started it: an operator to its launcher, a verb to the verb that runs it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,20 @@ import msgspec
 
 from graph.words import Boot
 
+BOUND = "RETRACER_BOUND"  # in the environment of a verb that shall end with the process that runs it
+
+
+def end_with_parent(how: signal.Signals) -> None:
+    """Let the system send this process a signal when its parent ends, even while native code runs. Linux only."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(1, how)  # PR_SET_PDEATHSIG
+
+
+def end_if_bound() -> None:
+    """Tie this process to its parent if the environment says so; what it starts itself is not tied by that."""
+    if os.environ.pop(BOUND, None):
+        end_with_parent(signal.SIGTERM)
+
 
 def outlive_nobody() -> None:
     """End this process when the launcher is gone, even if that was killed: its end of our stdin closes."""
@@ -21,8 +35,7 @@ def outlive_nobody() -> None:
             pass
         os._exit(3)
 
-    if sys.platform == "linux":  # also while a long call of native code holds the interpreter
-        ctypes.CDLL(None, use_errno=True).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+    end_with_parent(signal.SIGKILL)  # also while a long call holds the interpreter
     threading.Thread(target=watch, daemon=True).start()
 
 

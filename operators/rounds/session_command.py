@@ -17,6 +17,7 @@ import numpy.typing as npt
 from graph.codec import decode
 from graph.errors import UserError
 from graph.geometry import yaw
+from graph.lifeline import BOUND
 from graph.messages import Odometry, PointCloud, Pose, Truth
 from graph.recording import Recording
 from operators.rounds.schedule import Session
@@ -37,7 +38,7 @@ def verb(arguments: Sequence[str | Path], log: Path, *, threads: int = 1) -> str
             stdout=subprocess.PIPE,
             stderr=errors_file,
             text=True,
-            env={**environment, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            env={**environment, BOUND: "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
             check=False,
         )
     if done.returncode != 0:
