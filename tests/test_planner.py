@@ -10,7 +10,7 @@ from numba import njit
 
 from graph.contract import ports_of
 from graph.geometry import inverse, planar, transform
-from graph.messages import Goal, OccupancyGrid, PointCloud, Pose
+from graph.messages import Goal, OccupancyGrid, PointCloud, Pose, Tracks
 from operators.navigation.footprint import Footprint
 from operators.planner import Planner
 
@@ -290,3 +290,43 @@ def test_frame_before_its_pose_waits_for_it():
     costmap = planner.navigator.costmap
     x, _ = costmap.lattice.centre(*np.nonzero(costmap.obstacles.filled))
     assert np.abs(x - 3.0).max() < 0.05
+
+
+def hidden_after(people_reach, *, told=True):
+    """Show a planner a person at a distance, its echoes kept only beyond the ring; return how many it suspects."""
+    planner = Planner(Planner.Config(people="predict"))
+    origin = np.array([2.0, 2.0, LIDAR_HEIGHT])
+    person = [2.0 + people_reach - 0.1, 1.85, 0.0, 2.0 + people_reach + 0.1, 2.15, 1.8]
+    reach, clear = cast(RAYS, origin, np.array([*ROOM, person])), cast(RAYS, origin, np.array(ROOM))
+    hit, seen = reach < clear, (reach >= 0.9) & (RAYS[:, 2] * reach + LIDAR_HEIGHT > 0.05)
+    cloud = (RAYS * reach[:, None]).astype(np.float32)
+    base = planar(2.0, 2.0, 0.0)
+    planner.on_goal(Goal(measured_at=0, target=np.array([6.0, 6.0]), index=0, count=1))
+    for frame in range(4):
+        stamp = frame * PERIOD
+
+        def part(keep, stamp=stamp):
+            label = np.full(keep.sum(), 2, np.uint8)
+            return PointCloud(measured_at=stamp, points=cloud[keep], base_from_lidar=BASE_FROM_LIDAR, label=label)
+
+        planner.on_obstacles(part(seen & ~hit))
+        if told:
+            planner.on_people(part(seen & hit))
+        nobody = np.zeros((0, 2))
+        planner.on_tracks(
+            Tracks(
+                measured_at=stamp,
+                identity=np.zeros(0, np.int32),
+                position=nobody,
+                velocity=nobody,
+                unseen=np.zeros(0, np.float32),
+            )
+        )
+        planner.on_pose(Pose(measured_at=stamp, world_from_base=base))
+    return len(planner._presence.hidden)
+
+
+def test_who_gives_rays_back_is_seen_and_who_swallows_them_is_near():
+    assert hidden_after(1.6) == 0
+    assert hidden_after(0.6) == 1
+    assert hidden_after(1.6, told=False) == 0  # whose rays come back nobody said
