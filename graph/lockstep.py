@@ -169,7 +169,7 @@ class Lockstep:
 
     def through(self) -> int:
         """Return the stamp through which this operator has handled everything; it bounds who waits for it."""
-        return self._reached(self.edges, min((arrival.time for arrival in self.pending[:1]), default=INFINITY))
+        return self._reached(self.edges, self.pending[0].time if self.pending else INFINITY)
 
     def watermark(self) -> int:
         """Return the stamp through which this operator has emitted all it ever will."""

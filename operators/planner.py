@@ -5,6 +5,8 @@ planner:
   inputs: {goal: simulator/goal, map: localizer/occupancy, obstacles: triage/planning, people: triage/people,
     tracks: tracker/tracks, pose: localizer/pose}
   config: {people: predict}
+
+Where people are predicted and frames are classified, it wants `tracks` and `people`: whose echoes return is not near.
 """
 
 from __future__ import annotations

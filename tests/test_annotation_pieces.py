@@ -102,3 +102,11 @@ def test_a_shut_door_does_not_grow_together_with_its_wall_and_a_narrow_gap_does(
     gap = panel((2.03, 0.0), 0.0, 0.15)
     gap = gap._replace(movable=np.zeros(len(gap.points), np.float32))
     assert (classify(known, gap).new.label == PERMANENT).all()
+
+
+@pytest.mark.parametrize(("share", "leaves"), [(0.2, False), (0.3, True)])
+def test_a_piece_leaves_whole_from_a_quarter_on(share, leaves):
+    leaf = panel((0.0, 0.0), 0.0, 2.0)
+    seen_through = leaf.points[:, 0] > np.quantile(leaf.points[:, 0], 1.0 - share)
+    _, stays = refine(leaf, [np.where(seen_through, np.float32(1.0), np.float32(0.0))])
+    np.testing.assert_array_equal(stays, np.zeros(len(stays), np.bool_) if leaves else ~seen_through)

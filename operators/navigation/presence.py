@@ -61,6 +61,12 @@ def gaps(passed: Flags) -> list[tuple[float, float]]:
     return found
 
 
+def _occupied(bearing: Floats) -> Flags:
+    """Say of each sector (SECTORS,) whether one of the bearings (n,), radians, lies in it."""
+    sector = np.floor(bearing * (SECTORS / (2.0 * math.pi))).astype(np.int64) % SECTORS
+    return np.asarray(np.bincount(sector, minlength=SECTORS) > 0)
+
+
 def _turn(to: float, origin: float) -> float:
     return (to - origin + math.pi) % (2.0 * math.pi) - math.pi
 
@@ -81,18 +87,12 @@ class Presence:
         things: places (m, 2) of what is known to stand in the ring, in the world: it swallows rays, too.
         """
         x, y, z = points.astype(np.float64).T
-        height = (
-            world_from_lidar[2, 3] + z / np.maximum(np.hypot(x, y), 1e-6) * REST
-        )  # of the ray where somebody stands
-        trunk = (height > TRUNK[0]) & (height < TRUNK[1])
-        x, y = x[trunk], y[trunk]
-        bearing = np.arctan2(y, x) + math.atan2(world_from_lidar[1, 0], world_from_lidar[0, 0])
-        sector = np.floor(bearing * (SECTORS / (2.0 * math.pi))).astype(np.int64) % SECTORS
-        self._passed = np.bincount(sector, minlength=SECTORS) > 0
+        at_somebody = world_from_lidar[2, 3] + z / np.maximum(np.hypot(x, y), 1e-6) * REST  # height of the ray there
+        trunk = (at_somebody > TRUNK[0]) & (at_somebody < TRUNK[1])
+        turn = math.atan2(world_from_lidar[1, 0], world_from_lidar[0, 0])
+        self._passed = _occupied(np.arctan2(y[trunk], x[trunk]) + turn)
         self._eye = float(world_from_lidar[0, 3]), float(world_from_lidar[1, 3])
-        bearing = np.arctan2(things[:, 1] - self._eye[1], things[:, 0] - self._eye[0])
-        sector = np.floor(bearing * (SECTORS / (2.0 * math.pi))).astype(np.int64) % SECTORS
-        self._things = np.bincount(sector, minlength=SECTORS) > 0
+        self._things = _occupied(np.arctan2(things[:, 1] - self._eye[1], things[:, 0] - self._eye[0]))
 
     def company(self, identity: npt.NDArray[np.int32], walkers: Walkers, unseen: npt.NDArray[np.float32]) -> Walkers:
         """Return the people (k, 4) to keep clear of, from those (n, 4) whom a tracker follows.
@@ -111,8 +111,8 @@ class Presence:
                 self.hidden.append(Hidden(int(identity[index]), float(x), float(y), 0, 0))
         self.hidden = self._looked_for(gaps(self._passed), set(identity[seen].tolist()))
         self._notice()
-        known_ones = [one for one in self.hidden if one.identity >= 0 or one.frames >= NOTICED]
-        still = np.array([[one.x, one.y, 0.0, 0.0] for one in known_ones]).reshape(-1, 4)
+        believed = [one for one in self.hidden if one.identity >= 0 or one.frames >= NOTICED]
+        still = np.array([[one.x, one.y, 0.0, 0.0] for one in believed]).reshape(-1, 4)
         return np.concatenate([walkers[seen | (away >= BLIND)], still])
 
     def _looked_for(self, empty: list[tuple[float, float]], again: set[int]) -> list[Hidden]:
