@@ -204,6 +204,8 @@ def test_a_frame_of_another_place_does_not_converge_or_jumps():
     track = pointmap.track(scan(pose @ planar(0.5, 0.3, 0.25)), pose)
     assert not track.valid
     assert "no convergence" in track.reason
+    pointmap = PointMap(Settings(criteria=Criteria(iterations=6)))
+    pointmap.track(scan(pose), pose)
     far = pose @ planar(50.0, 0.0, 0.0)
     track = pointmap.track(scan(pose), far)
     assert not track.valid
@@ -246,6 +248,31 @@ def test_wheels_that_slip_neither_move_the_robot_nor_spoil_the_map(slip):
         assert track.added == 0
         assert len(pointmap.map) == before
     assert pointmap.track(scan(pose), pose @ planar(0.01, 0.0, 0.0)).added > 0
+
+
+def test_after_wheels_slipped_the_face_of_a_wall_that_is_near_to_odometry_is_not_trusted(monkeypatch):
+    pose = planar(1.5, -1.5, 0.3) @ BASE_FROM_LIDAR
+    pointmap = PointMap(Settings(watch=2))
+    frame = pointmap.prepare(scan(pose))
+    pointmap.enter(frame, pose)
+    right, wrong = pose, pose @ planar(0.15, 0.0, 0.0)
+    starts = []
+
+    def fitted(store, voxel, frame, start, criteria, state):
+        """Two faces attract a robot, each whoever starts nearer to it; the wrong one leaves some samples alone."""
+        starts.append(float((inverse(pose) @ start)[0, 3]))
+        off = starts[-1] > 0.075
+        return Alignment(wrong if off else right, True, 5, 0.93 if off else 0.998, 0.005)
+
+    monkeypatch.setattr("operators.pointmap.slam.align", fitted)
+    slipped = [pointmap.track_frame(frame, pose @ planar(slip, 0.0, 0.0)) for slip in (0.10, 0.14, 0.14)]
+    assert [error_of(track.world_from_lidar, pose)[0] for track in slipped] == [0.0, 0.0, 0.0]
+    assert [track.added for track in slipped] == [0, 0, 0]
+    assert starts == pytest.approx([0.10, 0.0, 0.0, 0.14, 0.0, 0.0, 0.14, 0.0, 0.0])
+    starts.clear()
+    for _ in range(4):
+        pointmap.track_frame(frame, pose @ planar(0.01, 0.0, 0.0))
+    assert starts == pytest.approx([0.01, 0.0, 0.0, 0.01, 0.0, 0.0, 0.01, 0.01])  # two frames more are doubted
 
 
 def test_the_wrong_face_of_a_wall_fits_worse_however_close_its_planes_are():

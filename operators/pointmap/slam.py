@@ -29,6 +29,7 @@ class Settings(NamedTuple):
     largest_turn: float = math.radians(15.0)
     doubtful: float = 0.03  # metres between odometry's word and the alignment's, beyond which wheels may have slipped
     doubtful_turn: float = math.radians(0.5)
+    watch: int = 20  # frames for which an alignment is doubted after a doubtful one
     grow: bool = True  # whether aligned frames enter a map that has points
     upright: float = 0.2  # share of its height and tilt that each pose of a level robot gives up
     seed: int = 0
@@ -74,6 +75,8 @@ class PointMap:
         self.map = VoxelMap(self.settings.map_voxel)
         self.frames = 0
         self.last: Pose | None = None  # of the frame before
+        self.step = np.eye(4)  # from the frame before that to it
+        self.watching = 0  # frames left for which alignments are doubted
         if initial is not None:
             self.map.insert_map(initial)
 
@@ -100,9 +103,11 @@ class PointMap:
             return self.enter(frame, guess)
         state = generator(self.settings.seed, self.frames)
         result = align(self.map.store, self.map.voxel_size, frame, guess, self.settings.criteria, state)
+        if self.last is not None and (self.watching or self._apart(guess, result.world_from_lidar)):
+            for start in self._without_slip(guess, self.last):
+                result = self._better(result, frame, start, state)
         calm = not self._apart(guess, result.world_from_lidar)
-        if not calm and self.last is not None:
-            result = self._better(result, frame, guess, self.last, state)
+        self.watching = max(self.watching - 1, 0) if calm else self.settings.watch
         pose = result.world_from_lidar
         if base_from_lidar is not None:
             pose = leveled(pose @ inverse(base_from_lidar), self.settings.upright) @ base_from_lidar
@@ -124,14 +129,20 @@ class PointMap:
         far = float(np.linalg.norm(step[:3, 3])) > self.settings.doubtful
         return far or rotation_angle(step) > self.settings.doubtful_turn
 
-    def _better(self, found: Alignment, frame: Frame, guess: Pose, last: Pose, state: State) -> Alignment:
-        """Align once more from where the robot was, as if only its wheels had turned; return what fits better.
+    def _without_slip(self, guess: Pose, last: Pose) -> tuple[Pose, Pose]:
+        """Return where a robot would be whose wheels had only turned: where it was, or as far on as the frame before.
 
         A robot that somebody blocks slips 0.1 m a frame, and a wall of 0.15 m has a face on either side.
         """
         still = guess.copy()
         still[:3, 3] = last[:3, 3]
-        other = align(self.map.store, self.map.voxel_size, frame, still, self.settings.criteria, state)
+        gone = guess.copy()
+        gone[:3, 3] = (last @ self.step)[:3, 3]
+        return still, gone
+
+    def _better(self, found: Alignment, frame: Frame, start: Pose, state: State) -> Alignment:
+        """Align once more from another start; return what fits better."""
+        other = align(self.map.store, self.map.voxel_size, frame, start, self.settings.criteria, state)
         reach = self.settings.criteria.final_reach
         if other.converged and (not found.converged or misfit(other, reach) < misfit(found, reach)):
             return other
@@ -148,13 +159,17 @@ class PointMap:
             if (self.settings.grow and grow) or not len(self.map)
             else 0
         )
-        self.frames += 1
-        self.last = world_from_lidar
+        self._go_on(world_from_lidar)
         return added
+
+    def _go_on(self, world_from_lidar: Pose) -> None:
+        self.frames += 1
+        if self.last is not None:
+            self.step = inverse(self.last) @ world_from_lidar
+        self.last = world_from_lidar
 
     def _refuse(
         self, guess: Pose, reason: str, inliers: float = 0.0, iterations: int = 0, residual: float = 0.0
     ) -> Track:
-        self.frames += 1
-        self.last = guess
+        self._go_on(guess)
         return Track(guess, False, reason, inliers, iterations, residual, 0)
