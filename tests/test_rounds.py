@@ -13,7 +13,7 @@ import yaml
 
 from graph.check import check
 from graph.errors import UserError
-from operators.rounds import experiment_command, rounds_command
+from operators.rounds import experiment_command, rounds_command, session_command
 from operators.rounds.experiment_command import Experiment
 from operators.rounds.report import page, summarize
 from operators.rounds.schedule import SCENARIOS, Schedule, Session
@@ -296,6 +296,17 @@ def test_killed_run_goes_on_where_it_was(stubs, tmp_path, cut):
     calls.clear()
     experiment(tmp_path / "cut").run()
     assert not calls
+
+
+def test_what_a_killed_launch_left_behind_is_in_nobodys_way(tmp_path, monkeypatch):
+    recording = tmp_path / "round-1-easy-A.mcap"
+    left = tmp_path / "round-1-easy-A.shards"
+    left.mkdir()
+    (left / "simulator.0.mcap").write_text("half a recording")
+    seen = []
+    monkeypatch.setattr(session_command, "verb", lambda words, log: seen.append(left.exists()) or "{}")
+    assert session_command.launch(tmp_path / "round-1-easy-A.yaml", recording) == {}
+    assert seen == [False]
 
 
 def test_recordings_can_be_kept(stubs, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -48,8 +49,9 @@ def verb(arguments: Sequence[str | Path], log: Path, *, threads: int = 1) -> str
 
 
 def launch(graph: Path, recording: Path) -> dict[str, Any]:
-    """Launch a graph file and return its outcome."""
+    """Launch a graph file and return its outcome; what a launch that was killed left behind makes room."""
     recording.unlink(missing_ok=True)
+    shutil.rmtree(recording.with_suffix(".shards"), ignore_errors=True)
     arguments: list[str | Path] = ["launch", graph, "--record", recording, "--quiet", "--json"]
     outcome: dict[str, Any] = json.loads(verb(arguments, recording.with_suffix(".log")))
     return outcome
