@@ -24,6 +24,7 @@ MOTOR = 6.0  # N m, the most a wheel's motor gives
 TOP_SPEED, TOP_TURN = 1.3, 1.0  # m/s, rad/s
 ACCELERATION, TURN_ACCELERATION = 1.0, 2.5  # m/s^2, rad/s^2
 FASTEST, FASTEST_TURN = 1.5, 1.5  # m/s, rad/s: what pushing and being pushed can do to the robot
+FASTEST_UP, FASTEST_TIP = 0.1, 0.3  # m/s, rad/s: with its ballast it is neither lifted nor tipped over
 MAST = 0.06, 0.68  # metres: width and top of the column that carries the lidar
 PERSON_REACH = 1.6  # metres from the robot within which people have bodies
 GLIDE = 6  # substeps between two placements of walking people
@@ -140,13 +141,15 @@ class Physics:
     def _hold(self) -> None:
         """Take the speed that no robot on wheels has: Bullet parts bodies that overlap by throwing the lighter one."""
         velocity, spin = p.getBaseVelocity(self.robot, physicsClientId=self.client)
-        fast, turning = math.hypot(velocity[0], velocity[1]), abs(spin[2])
-        if fast > FASTEST or turning > FASTEST_TURN:
+        fast, tipping = math.hypot(velocity[0], velocity[1]), math.hypot(spin[0], spin[1])
+        turning, rising = abs(spin[2]), velocity[2]
+        if fast > FASTEST or turning > FASTEST_TURN or tipping > FASTEST_TIP or rising > FASTEST_UP:
             slower, calmer = min(1.0, FASTEST / max(fast, 1e-9)), min(1.0, FASTEST_TURN / max(turning, 1e-9))
+            steadier = min(1.0, FASTEST_TIP / max(tipping, 1e-9))
             p.resetBaseVelocity(
                 self.robot,
-                [slower * velocity[0], slower * velocity[1], velocity[2]],
-                [spin[0], spin[1], calmer * spin[2]],
+                [slower * velocity[0], slower * velocity[1], min(rising, FASTEST_UP)],
+                [steadier * spin[0], steadier * spin[1], calmer * spin[2]],
                 physicsClientId=self.client,
             )
 

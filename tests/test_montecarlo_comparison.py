@@ -6,6 +6,7 @@ import argparse
 import io
 import json
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -13,12 +14,24 @@ from PIL import Image
 
 from graph.check import check
 from graph.cli import main
+from operators.montecarlo import localizers_command
 from operators.montecarlo.comparison import METHODS, Run, table
 from operators.montecarlo.localizers_command import add_arguments, batches, driven_graph, same_graph
 from operators.montecarlo.map_file import GridMap
 from operators.montecarlo.picture import FOUND, WALL, map_picture
 from operators.montecarlo.report import write_report
 from operators.rounds.variants import written
+
+
+class Step(NamedTuple):
+    """A call, as a ledger has it."""
+
+    milliseconds: int
+    port: str = "frame"
+
+    @property
+    def wall_duration(self) -> int:
+        return 1_000_000 * self.milliseconds
 
 
 def run(method="amcl", labels="none", errors=(0.2, 0.4), ending="tour finished", tour="A", name="driven") -> Run:
@@ -109,6 +122,21 @@ def test_a_map_is_drawn_over_the_walls_upright():
     assert len(columns) == 30
     assert (shown == WALL).all(axis=2).sum() == 1
     assert rows[0] < np.nonzero((shown == WALL).all(axis=2))[0][0]
+
+
+def test_a_driven_tour_says_how_it_ended_and_what_an_update_took(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    args = argparse.Namespace(output=tmp_path, keep=True)
+    steps = [(0, "localizer", Step(milliseconds)) for milliseconds in (1, 1, 1, 20, 30, 40)]
+    said = {"simulator": {"ending": {"tour_finished": False, "stuck": True}, "reached": 3, "targets": 7}}
+    said["localizer"] = {"updates": 3}
+    monkeypatch.setattr(localizers_command, "driven_graph", lambda *told: {})
+    monkeypatch.setattr(localizers_command, "_launch", lambda *told: (tmp_path / "r.mcap", {"summaries": said}))
+    monkeypatch.setattr(localizers_command, "Recording", lambda path: argparse.Namespace(steps=lambda name: steps))
+    monkeypatch.setattr(localizers_command, "distances", lambda read, operator: np.array([0.1, 0.2]))
+    localizers_command._run(args, [("driven", "hard", "A", "amcl", "truth")])
+    found = Run(**json.loads((tmp_path / "tours" / "driven-hard-A-amcl-truth.json").read_text()))
+    assert (found.ending, found.reached, found.targets, found.failed) == ("stuck", 3, 7, True)
+    assert found.update_ms == pytest.approx(30.0)
 
 
 def test_what_is_missing_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

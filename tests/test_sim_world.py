@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import pybullet
 import pytest
 
 from graph.geometry import wrap, yaw
@@ -130,6 +131,20 @@ def test_people_stop_the_robot_and_count() -> None:
     base = world.motion.world_from_base
     assert base[2, 2] > 0.99
     assert 0.0 < base[0, 3] < 8.0
+
+
+def test_nothing_tips_the_robot_over_or_lifts_it() -> None:
+    world = World(box_room(8.0, 8.0), NOBODY, "A", 0)
+    robot, client = world.physics.robot, world.physics.client
+    for roll, pitch, rise in ((8.0, 0.0, 0.0), (0.0, 8.0, 0.0), (0.0, 0.0, 3.0)):  # as bodies that overlap are parted
+        velocity, _ = pybullet.getBaseVelocity(robot, physicsClientId=client)
+        pybullet.resetBaseVelocity(robot, [*velocity[:2], rise], [roll, pitch, 0.0], physicsClientId=client)
+        for _ in range(10):
+            world.advance(0.5, 0.0)
+            base = world.motion.world_from_base
+            assert base[2, 2] > np.cos(np.radians(5.0))
+            assert base[2, 3] < 0.03
+    assert world.motion.linear == pytest.approx(0.5, abs=0.05)
 
 
 def test_odometry_begins_at_the_truth_and_is_the_truth_without_noise() -> None:

@@ -119,12 +119,12 @@ def _run(args: argparse.Namespace, jobs: list[Job]) -> None:
         name = "-".join((table, scenario, tour, labels))
         graph = same_graph(args, _shared(args, scenario, tour), [job[3] for job in jobs], labels)
     recording, outcome = _launch(args, graph, name)
-    read = Recording(recording)
+    read, said = Recording(recording), outcome["summaries"]
     for job in jobs:
         operator = "localizer" if table == "driven" else job[3]
         seconds = sorted(step.wall_duration / 1e9 for _, _, step in read.steps(operator) if step.port == "frame")
-        updates = int(outcome.get(operator, {}).get("updates", len(seconds)))  # the others took next to nothing
-        simulated = outcome.get("simulator", {}) if table == "driven" else {}
+        updates = int(said.get(operator, {}).get("updates", len(seconds)))  # the others took next to nothing
+        simulated = said["simulator"] if table == "driven" else {}
         ending = next((ending.replace("_", " ") for ending, yes in simulated.get("ending", {}).items() if yes), "")
         found = Run(
             *job,
@@ -192,7 +192,7 @@ def _shared(args: argparse.Namespace, scenario: str, tour: str) -> Path:
 
 
 def _launch(args: argparse.Namespace, graph: dict[str, Any], name: str) -> tuple[Path, dict[str, Any]]:
-    """Launch a graph; returns its recording and what its operators summed up, by name."""
+    """Launch a graph; returns its recording and its outcome."""
     file, recording = args.output / "graphs" / f"{name}.yaml", args.output / "recordings" / f"{name}.mcap"
     for path in (file, recording):
         path.parent.mkdir(exist_ok=True)
