@@ -152,6 +152,25 @@ def test_the_command_evaluates_by_evo_and_by_relations(tmp_path: Path, capsys: p
     assert main(["evaluate-trajectory", str(tmp_path / "none.tum"), str(tmp_path / "truth.tum")]) == 2
 
 
+def test_relations_of_a_loop_tell_whether_it_was_closed():
+    def rounds(drift):
+        """Drive twice around a circle, a pose each second; what is estimated drifts sideways in the second round."""
+        poses = [
+            planar(5.0 * np.cos(angle) + drift * (n >= 120), 5.0 * np.sin(angle), angle + np.pi / 2)
+            for n, angle in enumerate(np.arange(240) * np.pi / 60.0)
+        ]
+        return Trajectory(np.array(poses), np.arange(240, dtype=np.int64) * 1_000_000_000)
+
+    relations = relations_of(rounds(0.0))
+    revisits = [relation for relation in relations if relation.second - relation.first > 60e9]
+    assert len(relations) == 239 + len(revisits)
+    after = [(relation.second - relation.first) // 1_000_000_000 for relation in revisits]
+    assert after == [120] * 120 + [119, 118, 117]  # the last three poses but one are within a metre of the last
+    errors = relation_errors(rounds(0.3), relations).translation
+    assert (errors > 1e-9).sum() == 1 + 120  # the step into the second round, and every revisit
+    assert errors[239 : 239 + 120] == pytest.approx(0.3)
+
+
 @pytest.mark.skipif(not INTEL.is_dir(), reason="the Intel log is not here")
 def test_a_public_corrected_log_is_read_and_its_relations_hold_for_itself():
     known = log_trajectory(INTEL / "intel-corrected.log.gz")

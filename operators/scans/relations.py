@@ -11,11 +11,14 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from graph.geometry import Matrix, inverse, rotation_angle
+from graph.geometry import Matrix, inverse, rotation_angle, wrap
 from operators.scans.scan import ScanError
 from operators.scans.session import placement
 from operators.scans.stamps import nanoseconds
 from operators.scans.trajectory import Trajectory
+
+APART = 60.0  # seconds after which a place that is seen again is a revisit
+REVISIT, ALIKE = 1.0, np.pi / 4  # metres, radians
 
 
 class Relation(NamedTuple):
@@ -56,14 +59,25 @@ def read_relations(path: Path) -> list[Relation]:
 
 
 def relations_of(reference: Trajectory) -> list[Relation]:
-    """Take the motions between neighbouring poses of a trajectory for relations. Raises ScanError without stamps."""
+    """Take motions of a trajectory for relations: between neighbouring poses, and from each to its nearest revisit.
+
+    A revisit is a pose APART seconds later or more, within REVISIT metres and a heading within ALIKE radians: it counts
+    what a loop that was not closed leaves. Raises ScanError without stamps.
+    """
     if reference.stamps is None:
         raise ScanError("relations want stamps; without them nobody knows which poses belong together")
     stamps = reference.stamps.tolist()
-    return [
-        Relation(stamps[n - 1], stamps[n], inverse(reference.poses[n - 1]) @ reference.poses[n])
-        for n in range(1, len(stamps))
-    ]
+    places = reference.poses[:, :3, 3]
+    headings = np.arctan2(reference.poses[:, 1, 0], reference.poses[:, 0, 0])
+    pairs = [(number - 1, number) for number in range(1, len(stamps))]
+    for first in range(len(stamps)):
+        away = np.linalg.norm(places - places[first], axis=1)
+        again = (reference.stamps >= stamps[first] + APART * 1e9) & (np.abs(wrap(headings - headings[first])) < ALIKE)
+        again &= away < REVISIT
+        if again.any():
+            pairs.append((first, int(np.argmin(np.where(again, away, np.inf)))))
+    poses = reference.poses
+    return [Relation(stamps[a], stamps[b], inverse(poses[a]) @ poses[b]) for a, b in pairs]
 
 
 def relation_errors(estimate: Trajectory, relations: list[Relation]) -> RelationErrors:

@@ -44,7 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--align", action="store_true", help="first lay the estimate onto the reference")
     parser.add_argument("--tolerance", type=float, default=0.01, metavar="S", help="between stamps that are one moment")
     parser.add_argument("--delta", type=float, default=1.0, metavar="M", help="of driving over which drift is measured")
-    parser.add_argument("--relations", action="store_true", help="take the reference's own motions for relations")
+    parser.add_argument(
+        "--relations", action="store_true", help="take the reference's own motions and revisits for relations"
+    )
     parser.add_argument("--json", action="store_true", help="print the errors as JSON")
 
 
