@@ -29,7 +29,7 @@ class Settings(NamedTuple):
     largest_turn: float = math.radians(15.0)
     doubtful: float = 0.03  # metres between odometry's word and the alignment's, beyond which wheels may have slipped
     doubtful_turn: float = math.radians(0.5)
-    watch: int = 20  # frames for which an alignment is doubted after a doubtful one
+    watch: int = 20  # frames after a doubtful alignment for which the next are doubted, too
     grow: bool = True  # whether aligned frames enter a map that has points
     upright: float = 0.2  # share of its height and tilt that each pose of a level robot gives up
     seed: int = 0
@@ -130,7 +130,7 @@ class PointMap:
         return far or rotation_angle(step) > self.settings.doubtful_turn
 
     def _without_slip(self, guess: Pose, last: Pose) -> tuple[Pose, Pose]:
-        """Return where a robot would be whose wheels had only turned: where it was, or as far on as the frame before.
+        """Return poses (4, 4) of a robot whose wheels only turned: where it was, or as far on as the frame before.
 
         A robot that somebody blocks slips 0.1 m a frame, and a wall of 0.15 m has a face on either side.
         """
@@ -141,7 +141,7 @@ class PointMap:
         return still, gone
 
     def _better(self, found: Alignment, frame: Frame, start: Pose, state: State) -> Alignment:
-        """Align once more from another start; return what fits better."""
+        """Align once more from another start (4, 4), world_from_lidar; return what fits better."""
         other = align(self.map.store, self.map.voxel_size, frame, start, self.settings.criteria, state)
         reach = self.settings.criteria.final_reach
         if other.converged and (not found.converged or misfit(other, reach) < misfit(found, reach)):
@@ -163,6 +163,7 @@ class PointMap:
         return added
 
     def _go_on(self, world_from_lidar: Pose) -> None:
+        """Count a frame, and remember its pose (4, 4) and the step to it."""
         self.frames += 1
         if self.last is not None:
             self.step = inverse(self.last) @ world_from_lidar

@@ -18,7 +18,7 @@ from operators.scans.stamps import nanoseconds
 from operators.scans.trajectory import Trajectory
 
 APART = 60.0  # seconds after which a place that is seen again is a revisit
-REVISIT, ALIKE = 1.0, np.pi / 4  # metres, radians
+REVISIT, ALIKE = 1.0, np.pi / 4  # metres and radians within which it is the same place, looked at the same way
 
 
 class Relation(NamedTuple):
