@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import matplotlib.cbook
@@ -307,6 +310,30 @@ def test_what_a_killed_launch_left_behind_is_in_nobodys_way(tmp_path, monkeypatc
     monkeypatch.setattr(session_command, "verb", lambda words, log: seen.append(left.exists()) or "{}")
     assert session_command.launch(tmp_path / "round-1-easy-A.yaml", recording) == {}
     assert seen == [False]
+
+
+def test_disk_is_measured_while_recordings_vanish(tmp_path):
+    (tmp_path / "kept.mcap").write_bytes(b"frames")
+    stop = threading.Event()
+
+    def record_and_delete():
+        n = 0
+        while not stop.is_set():
+            n += 1
+            shards = tmp_path / f"{n}.shards"
+            shards.mkdir()
+            (shards / "simulator.0.mcap").touch()
+            (tmp_path / f"{n}.mcap").touch()
+            shutil.rmtree(shards)
+            (tmp_path / f"{n}.mcap").unlink()
+
+    with ThreadPoolExecutor(1) as crew:
+        session = crew.submit(record_and_delete)
+        try:
+            assert {experiment_command.bytes_in(tmp_path) for _ in range(3000)} == {6}
+        finally:
+            stop.set()
+        session.result()
 
 
 def test_recordings_can_be_kept(stubs, tmp_path):

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,16 @@ from operators.rounds.variants import listening_graph, robot, session_graph, wri
 MOST_DISK = 20.0  # GB
 OTHER_LIDAR = {"lidar": "hdl32e", "rolling": True, "dropout": 0.2}  # twice the columns, one after the other, with gaps
 VERSIONS = ("numpy", "numba", "scipy", "torch", "pybullet", "embreex", "eclipse-zenoh", "mcap")
+
+
+def bytes_in(folder: Path) -> int:
+    """Add up the files below a folder, in bytes, while sessions still write there and delete."""
+    total = 0
+    for place, _, names in os.walk(folder):
+        for name in names:
+            with suppress(FileNotFoundError):
+                total += Path(place, name).stat().st_size
+    return total
 
 
 class Settings(msgspec.Struct, frozen=True):
@@ -131,7 +142,7 @@ class Experiment:
     def lap(self, name: str, group: str) -> None:
         """Note the time since the last lap."""
         now = time.monotonic()
-        size = sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file()) / 1e9
+        size = bytes_in(self.folder) / 1e9
         self.stages.append({"stage": name, "group": group, "seconds": now - self.begun, "disk_gb": size})
         self.begun = now
         write_json(self.folder / "stages.json", self.stages)
