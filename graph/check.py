@@ -122,7 +122,9 @@ class _Review:
         entry = graph.operators[name]
         try:
             if isinstance(self.draft.data["operators"][name].get("config", {}), dict):
-                build_config(kind, entry.config, graph.root, operator=name)
+                config = build_config(kind, entry.config, graph.root, operator=name)
+                if text := kind.missing(config, frozenset(entry.inputs)):
+                    self.warnings.append(self.draft.mistake(("operators", name, "inputs"), f"{name}: {text}"))
         except ConfigError as error:
             for fault in error.faults:
                 self.draft.add(("operators", name, "config", *fault.path), fault.text, key=fault.key)

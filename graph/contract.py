@@ -49,6 +49,11 @@ class Operator:
     def warm_up(cls) -> None:
         """Run on made-up data what has to be compiled; called before the operator is constructed."""
 
+    @classmethod
+    def missing(cls, config: Any, wired: frozenset[str]) -> str:
+        """Say what does less than its configuration promises, given which inputs are wired; nothing if all is well."""
+        return ""
+
     def on_start(self) -> Any:
         return None
 

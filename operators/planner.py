@@ -99,6 +99,14 @@ class Planner(Operator):
             )
             rehearsed.on_pose(Pose(measured_at=stamp, world_from_base=np.eye(4)))
 
+    @classmethod
+    def missing(cls, config: Config, wired: frozenset[str]) -> str:
+        """Say without which inputs nobody can be predicted, or is remembered where the lidar is blind."""
+        wanted = [port for port in ("tracks", "people") if port not in wired]
+        if config.people == "ignore" or not wanted:
+            return ""
+        return f"people: predict wants {' and '.join(wanted)} wired; without, people may go unseen"
+
     def on_goal(self, goal: Goal) -> None:
         self.navigator.set_goal(float(goal.target[0]), float(goal.target[1]))
 

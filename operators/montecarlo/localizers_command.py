@@ -29,6 +29,7 @@ from operators.rounds.variants import listening_graph, robot, with_labels, writt
 
 TABLES = ("same", "driven")
 SHARED = "operators.localizer:TrueLocalizer"  # drives the recordings that all localizers share
+SLIPPING = {"odom_alpha3": 0.8}  # not amcl's 0.1: wheels that push against somebody turn, and the robot stands still
 MAP_PERIOD = 5.0  # seconds between the maps of gmapping where nobody plans on them, as in ROS
 Job = tuple[str, str, str, str, str]  # table, scenario, tour, method, labels
 
@@ -243,7 +244,7 @@ def _localizer(args: argparse.Namespace, robots: dict[str, Any], method: str) ->
     """Return the entry of a localizer, made of the robot's: another class and another map, and what is recorded."""
     entry = copy.deepcopy(robots)
     entry["run"] = METHODS[method]
-    entry["config"] = {"map": str(args.map.resolve())} if method == "amcl" else {}
+    entry["config"] = {"map": str(args.map.resolve()), **SLIPPING} if method == "amcl" else {}
     digests = {"amcl": ("occupancy",), "gmapping": (), "pointmap": ("map", "occupancy")}[method]
     entry["record"] = dict.fromkeys(digests, "digest")
     return entry
