@@ -330,7 +330,7 @@ def test_disk_is_measured_while_recordings_vanish(tmp_path):
     with ThreadPoolExecutor(1) as crew:
         session = crew.submit(record_and_delete)
         try:
-            assert {experiment_command.bytes_in(tmp_path) for _ in range(3000)} == {6}
+            assert {session_command.bytes_in(tmp_path) for _ in range(3000)} == {6}
         finally:
             stop.set()
         session.result()

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,22 +19,20 @@ import numpy as np
 from graph.errors import UserError
 from operators.rounds.report import page, summarize
 from operators.rounds.schedule import LIDAR, TRUTH, Labels, Schedule, Session
-from operators.rounds.session_command import keep_picture, launch, read_json, record_of, verb, write_json
+from operators.rounds.session_command import (
+    bytes_in,
+    keep_picture,
+    launch,
+    read_json,
+    record_of,
+    verb,
+    write_json,
+)
 from operators.rounds.variants import listening_graph, robot, session_graph, written
 
 MOST_DISK = 20.0  # GB
 OTHER_LIDAR = {"lidar": "hdl32e", "rolling": True, "dropout": 0.2}  # twice the columns, one after the other, with gaps
 VERSIONS = ("numpy", "numba", "scipy", "torch", "pybullet", "embreex", "eclipse-zenoh", "mcap")
-
-
-def bytes_in(folder: Path) -> int:
-    """Add up the files below a folder, in bytes, while sessions still write there and delete."""
-    total = 0
-    for place, _, names in os.walk(folder):
-        for name in names:
-            with suppress(FileNotFoundError):
-                total += Path(place, name).stat().st_size
-    return total
 
 
 class Settings(msgspec.Struct, frozen=True):

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -151,6 +152,16 @@ def keep_picture(recording: Path, target: Path) -> None:
         assert best.truth is not None
         rings = best.ring if best.ring is not None else np.zeros(0, np.uint8)
         np.savez(target, points=best.points, truth=best.truth, ring=rings, base_from_lidar=best.base_from_lidar)
+
+
+def bytes_in(folder: Path) -> int:
+    """Add up the files below a folder, in bytes, while sessions still write there and delete."""
+    total = 0
+    for place, _, names in os.walk(folder):
+        for name in names:
+            with suppress(FileNotFoundError):
+                total += Path(place, name).stat().st_size
+    return total
 
 
 def read_json(path: Path) -> Any:
