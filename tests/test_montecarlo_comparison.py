@@ -90,6 +90,7 @@ def test_all_methods_listen_to_one_recording_side_by_side(tmp_path: Path, labels
     add_arguments(parser)
     args = parser.parse_args(["-o", str(tmp_path)])
     graph = same_graph(args, tmp_path / "tour.mcap", list(METHODS), labels)
+    assert graph["operators"]["amcl"]["config"]["odom_alpha3"] == 0.8
     for method, kind in METHODS.items():
         assert graph["operators"][method]["run"] == kind
         assert graph["operators"][method]["inputs"]["frame"] == f"triage_{method}/localization"

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from operators.montecarlo import Amcl, GridMap, MapError, Parameters, flatten, load_map, save_map
 from operators.montecarlo.likelihood import free_places, likelihood_field, weigh
+from operators.montecarlo.localizers_command import SLIPPING
 from operators.montecarlo.motion import Alphas, compose, difference, move
 from operators.montecarlo.resampling import (
     effective,
@@ -173,6 +174,24 @@ def test_a_drive_is_followed_and_the_same_seed_says_the_same_bits():
     assert [b.pose.tobytes() for b in first[1]] == [b.pose.tobytes() for b in second[1]]
     other = drive(Amcl(room(), Parameters(seed=4), start=START))
     assert other[1][-1].pose.tobytes() != first[1][-1].pose.tobytes()
+
+
+def spin(amcl: Amcl, updates=15):
+    """Drive a bit, then turn the wheels on the spot; return the error in metres after that."""
+    drive(amcl, steps=6)
+    pose, ends = seen(5)
+    odometry = amcl.odometry.copy()
+    for _ in range(updates):
+        odometry = compose(odometry[None], np.array([0.13, 0.0, 0.0]))[0]
+        belief = amcl.step(odometry, ends)
+    return float(np.hypot(*(belief.pose - pose)[:2]))
+
+
+def test_a_robot_whose_wheels_slip_is_kept_where_its_motion_model_knows_of_that():
+    slipping = [spin(Amcl(room(), Parameters(seed=seed, **SLIPPING), start=START)) for seed in range(5)]
+    gripping = [spin(Amcl(room(), Parameters(seed=seed), start=START)) for seed in range(5)]
+    assert max(slipping) < 1.0  # of 1.95 m for which the wheels have turned
+    assert min(gripping) > 1.5
 
 
 def test_a_scan_is_used_only_where_the_robot_has_moved():
