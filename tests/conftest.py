@@ -6,10 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from graph.check import require
 from graph.inprocess import launch_in_process
 from graph.recording import Recording
+
+settings.register_profile("tests", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("tests")  # a first example may have to compile
 
 ROOT = Path(__file__).parents[1]
 

@@ -199,6 +199,16 @@ def test_low_box_is_remembered_in_the_blind_ring():
     assert tour.building.least_room > 0.02
 
 
+@pytest.mark.parametrize("room", [0.022, 0.03])
+def test_robot_pushed_against_a_wall_gets_loose(room):
+    """Beside a wall the room varies by a centimetre from cell to cell: without any slack no motion would be left."""
+    tour = Tour(Building([*ROOM, wall(1.0, 5.0, 6.0, 5.5)], (1.5, 3.0, 0.0)), [(7.0, 3.0)]).run(2)
+    tour.building.pose = np.array([3.2, 5.0 - 0.5 * tour.building.footprint.width - room, 0.0])
+    tour.run(25)
+    assert "recover" in tour.statuses
+    assert tour.reached == 1
+
+
 def test_person_in_the_door_is_waited_for():
     boxes = [*two_rooms(), [3.8, 3.6, 0.0, 4.2, 4.5, 1.7]]
     tour = Tour(Building(boxes, (1.5, 4.0, 0.0)), [(7.0, 4.0)]).run(8)

@@ -28,6 +28,7 @@ STILL, STILL_TURN = 0.15, 0.6  # metres and radians: moving less than this
 STILL_FOR = 30  # periods, is being stuck
 ATTEMPTS = 8  # recoveries within FRESH metres after which a target is called unreachable
 FRESH = 1.0  # metres
+LOOSE = 0.3  # metres from where the robot was wedged
 REST = 200  # periods after which an unreachable target is tried again
 CAREFUL_SPEED = 0.4  # m/s at most, while the localizer is not sure
 
@@ -51,6 +52,7 @@ class Recovery:
         """Plan the motions. attempt: from 0, each does something else; turn: radians to the left to face the way."""
         back = Twist(-limits.reverse, 0.0)
         side = math.copysign(0.8 * limits.turn, turn)
+        self.moved = False
         spin, other = Twist(0.0, side), Twist(0.0, -side)
         facing = min(round(abs(turn) / (0.8 * limits.turn) / STEP), 40)
         self.motions: list[tuple[Twist, int]] = [
@@ -98,6 +100,8 @@ class Navigator:
         self._attempts = 0
         self._attempt_place = (0.0, 0.0)
         self._given_up = 0  # periods left of not trying
+        self._wedged = math.inf  # metres of room that do where no motion was left
+        self._wedged_at = (0.0, 0.0)
         self._walkers = NOBODY
 
     def set_goal(self, x: float, y: float) -> None:
@@ -160,6 +164,8 @@ class Navigator:
             return Twist(), "unreachable", None
         if math.dist(pose[:2], self._attempt_place) > FRESH:
             self._attempts, self._attempt_place = 0, pose[:2]
+        if math.dist(pose[:2], self._wedged_at) > LOOSE:
+            self._wedged = math.inf
         around = self.costmap.window(pose[0], pose[1], self._side, self._side / 4.0)
         if self._recovery is None and self._stuck(pose):
             self._recover(pose)
@@ -171,7 +177,9 @@ class Navigator:
         seconds_per_cost = self._field_lattice.resolution / (FREE * UNIT) / self.limits.speed
         way = way_around(self._field, self._field_lattice, pose[0], pose[1], self._side, seconds_per_cost)
         top_speed = min(top_speed, math.sqrt(2.0 * self.limits.acceleration * left))  # so as to stop at the goal
-        choice = self.window.choose(pose, self.commands.latest, around, way, top_speed=top_speed, walkers=self._walkers)
+        choice = self.window.choose(
+            pose, self.commands.latest, around, way, top_speed=top_speed, walkers=self._walkers, wedged=self._wedged
+        )
         return choice.target, "follow", choice.trajectory
 
     def _search(self, pose: Planar) -> None:
@@ -232,14 +240,18 @@ class Navigator:
         self._attempts += 1
 
     def _get_loose(self, pose: Planar, around: Surroundings) -> Twist | None:
-        """Return the present motion of the recovery, or None when it is over."""
+        """Return the present motion of the recovery, or None when it is over; the robot is wedged if it had none."""
         assert self._recovery is not None
         motions = self._recovery.motions
         while motions:
             twist, steps = motions.pop(0)
-            if steps > 0 and self.window.free_steps(pose, twist, around, 3, walkers=self._walkers) == 3:
+            free = self.window.free_steps(pose, twist, around, 3, walkers=self._walkers, wedged=self._wedged)
+            if steps > 0 and free == 3:
                 motions.insert(0, (twist, steps - 1))
+                self._recovery.moved |= twist != Twist()
                 return twist
+        if not self._recovery.moved:
+            self._wedged, self._wedged_at = min(self._wedged, self.window.wedged(pose, around)), pose[:2]
         self._recovery = None
         self._until_replan = 0
         self._trail.clear()
