@@ -53,7 +53,9 @@ def error_boxes(boxes: Sequence[dict[str, Any]], groups: Sequence[str], scenario
         axis.plot([], [], "s", color=ROUND_COLOURS[number % len(ROUND_COLOURS)], ms=9)[0]
         for number in range(len(groups))
     ]
-    axis.legend(handles, groups, fontsize=8, ncols=len(groups))
+    axis.legend(
+        handles, groups, fontsize=8, ncols=len(groups), frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0)
+    )
     return embedded(figure)
 
 

@@ -47,7 +47,7 @@ def summarize(told: Record) -> Record:
         "comparison_cm": boxes(compared, labels, scenarios),
         "driving": driving(records, groups, scenarios),
         "failed": [
-            {key: item[key] for key in ("name", "seed", "ending", "reached", "targets")}
+            {key: item.get(key, 0) for key in ("name", "seed", "ending", "reached", "skipped", "targets")}
             for item in records
             if item["reached"] < item["targets"]
         ],
@@ -151,10 +151,16 @@ def page(told: Record, picture: dict[str, Any] | None = None) -> str:
         ]
     if told["failed"]:
         lines = [
-            [item["name"], str(item["seed"]), item["ending"], f"{item['reached']} of {item['targets']}"]
+            [
+                item["name"],
+                str(item["seed"]),
+                item["ending"].replace("_", " "),
+                f"{item['reached']} of {item['targets']}",
+                str(item["skipped"]),
+            ]
             for item in told["failed"]
         ]
-        parts += ["<p>Tours that failed:</p>", table(["session", "seed", "ending", "targets"], lines)]
+        parts += ["<p>Tours that failed:</p>", table(["session", "seed", "ending", "reached", "given up"], lines)]
     parts += [
         "<h2>Localization error</h2><p>Distance on the floor between believed and true place, at 10 Hz, without "
         "alignment; each session's own drive, aborted ones included.</p>",

@@ -26,7 +26,7 @@ from operators.rounds.schedule import Session
 from operators.rounds.tally import Track, driven_into, errors
 
 ENCOUNTER = 10  # periods without touch after which a contact counts as a new one
-KEPT = ("targets", "reached", "driven_m", "time_s", "collisions_with_people", "collisions_with_things")
+KEPT = ("targets", "reached", "skipped", "driven_m", "time_s", "collisions_with_people", "collisions_with_things")
 PICTURE = "picture.npz"
 
 
