@@ -51,7 +51,10 @@ class Operator:
 
     @classmethod
     def missing(cls, config: Any, wired: frozenset[str]) -> str:
-        """Say what does less than its configuration promises, given which inputs are wired; nothing if all is well."""
+        """Return what `check` warns of: an input without which this configuration does less than it says; "" if none.
+
+        wired: the inputs that the graph feeds.
+        """
         return ""
 
     def on_start(self) -> Any:

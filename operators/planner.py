@@ -101,7 +101,7 @@ class Planner(Operator):
 
     @classmethod
     def missing(cls, config: Config, wired: frozenset[str]) -> str:
-        """Say without which inputs nobody can be predicted, or is remembered where the lidar is blind."""
+        """Warn where people cannot be predicted (`tracks`), or not where the lidar is blind (`people`)."""
         wanted = [port for port in ("tracks", "people") if port not in wired]
         if config.people == "ignore" or not wanted:
             return ""

@@ -180,9 +180,9 @@ def told(records):
 
 
 def test_page_says_what_the_json_says():
-    summary = summarize(told([record("round 1", "easy", "A", 4), record("round 1", "hard", "A", 1)]))
+    summary = summarize(told([record("round 1", "easy", "A", 4), record("round 1", "hard", "A", 1, skipped=2)]))
     json.dumps(summary, allow_nan=True)
-    assert [item["name"] for item in summary["failed"]] == ["round 1-hard-A"]
+    assert [(item["name"], item["skipped"]) for item in summary["failed"]] == [("round 1-hard-A", 2)]
     picture = {
         "points": np.random.default_rng(0).normal(0, 3, (50, 3)).astype(np.float32),
         "labellings": [("truth", np.arange(50, dtype=np.uint8) % 5)],
@@ -192,6 +192,7 @@ def test_page_says_what_the_json_says():
     assert "(100 %)" in text  # the paper's
     assert "25 %" in text
     assert "x&lt;y" in text
+    assert "<td>stuck</td><td>1 of 4</td><td>2</td>" in text
     assert text.count("data:image/png") == 5
 
 

@@ -1,6 +1,8 @@
 """Drive with AMCL, Gmapping and PointMap*, with labels and without, and localize on shared recordings with each.
 
 retracer localizers -o build/localizers --weights weights.safetensors
+
+AMCL's motion model reckons with wheels that slip when the robot pushes against somebody; else all have their defaults.
 """
 
 from __future__ import annotations

@@ -50,9 +50,9 @@ class Recovery:
 
     def __init__(self, attempt: int, turn: float, limits: Limits) -> None:
         """Plan the motions. attempt: from 0, each does something else; turn: radians to the left to face the way."""
+        self.moved = False  # whether any of them was possible
         back = Twist(-limits.reverse, 0.0)
         side = math.copysign(0.8 * limits.turn, turn)
-        self.moved = False
         spin, other = Twist(0.0, side), Twist(0.0, -side)
         facing = min(round(abs(turn) / (0.8 * limits.turn) / STEP), 40)
         self.motions: list[tuple[Twist, int]] = [
@@ -100,8 +100,8 @@ class Navigator:
         self._attempts = 0
         self._attempt_place = (0.0, 0.0)
         self._given_up = 0  # periods left of not trying
-        self._wedged = math.inf  # metres of room that do where no motion was left
-        self._wedged_at = (0.0, 0.0)
+        self._tolerated = math.inf  # metres of room that do since no recovery could move the robot
+        self._wedged_at = (0.0, 0.0)  # where that was
         self._walkers = NOBODY
 
     def set_goal(self, x: float, y: float) -> None:
@@ -165,7 +165,7 @@ class Navigator:
         if math.dist(pose[:2], self._attempt_place) > FRESH:
             self._attempts, self._attempt_place = 0, pose[:2]
         if math.dist(pose[:2], self._wedged_at) > LOOSE:
-            self._wedged = math.inf
+            self._tolerated = math.inf
         around = self.costmap.window(pose[0], pose[1], self._side, self._side / 4.0)
         if self._recovery is None and self._stuck(pose):
             self._recover(pose)
@@ -178,7 +178,13 @@ class Navigator:
         way = way_around(self._field, self._field_lattice, pose[0], pose[1], self._side, seconds_per_cost)
         top_speed = min(top_speed, math.sqrt(2.0 * self.limits.acceleration * left))  # so as to stop at the goal
         choice = self.window.choose(
-            pose, self.commands.latest, around, way, top_speed=top_speed, walkers=self._walkers, wedged=self._wedged
+            pose,
+            self.commands.latest,
+            around,
+            way,
+            top_speed=top_speed,
+            walkers=self._walkers,
+            tolerated=self._tolerated,
         )
         return choice.target, "follow", choice.trajectory
 
@@ -245,14 +251,19 @@ class Navigator:
         motions = self._recovery.motions
         while motions:
             twist, steps = motions.pop(0)
-            free = self.window.free_steps(pose, twist, around, 3, walkers=self._walkers, wedged=self._wedged)
-            if steps > 0 and free == 3:
+            if steps > 0 and self._free(pose, twist, around):
                 motions.insert(0, (twist, steps - 1))
                 self._recovery.moved |= twist != Twist()
                 return twist
         if not self._recovery.moved:
-            self._wedged, self._wedged_at = min(self._wedged, self.window.wedged(pose, around)), pose[:2]
+            self._tolerated = min(self._tolerated, self.window.tolerated(pose, around))
+            self._wedged_at = pose[:2]
         self._recovery = None
         self._until_replan = 0
         self._trail.clear()
         return None
+
+    def _free(self, pose: Planar, twist: Twist, around: Surroundings) -> bool:
+        """Say whether a motion of the recovery touches nothing and nobody in its next periods."""
+        walkers, tolerated = self._walkers, self._tolerated
+        return self.window.free_steps(pose, twist, around, 3, walkers=walkers, tolerated=tolerated) == 3

@@ -114,14 +114,15 @@ def seconds_left(way: Way, x: float, y: float) -> float:
 
 
 @njit(cache=True)
-def least_room(padding: float, here: float, wedged: float) -> float:
-    """Return the room that an arc must leave: who already stands closer may leave, not come closer still.
+def least_room(padding: float, here: float, tolerated: float) -> float:
+    """Return the metres of room that an arc must leave: who already stands closer may leave, not come closer still.
 
-    wedged: less than `here` where nothing moved so, along a wall whose cells are no straight line; else infinite.
+    tolerated: metres that do where the robot cannot move otherwise; else infinite. The room along a straight wall
+    seems to vary by a centimetre, its cells being squares, and a robot that nearly touches it would never move again.
     """
     if here < TOUCHING:
         return here - SLACK
-    return min(padding, here, wedged)
+    return min(padding, here, tolerated)
 
 
 @njit(cache=True)
@@ -222,7 +223,7 @@ def _choose(
     around: Surroundings,
     body: Body,
     padding: float,
-    wedged: float,
+    tolerated: float,
     way: Way,
     walkers: Walkers,
 ) -> tuple[float, float, float, npt.NDArray[np.float64]]:
@@ -232,7 +233,7 @@ def _choose(
     poses[0, 0], poses[0, 1], poses[0, 2] = start
     speeds[0], turns[0] = speed_now, turn_now
     here = room(around, body, COMFORT, start[0], start[1], start[2])
-    needed = least_room(padding, here, wedged)
+    needed = least_room(padding, here, tolerated)
     best, best_speed, best_turn = math.inf, 0.0, 0.0
     trajectory = poses[:1].copy()
     for i in range(len(speeds_wanted)):
@@ -277,12 +278,12 @@ class DynamicWindow:
         *,
         top_speed: float,
         walkers: Walkers = NOBODY,
-        wedged: float = math.inf,
+        tolerated: float = math.inf,
     ) -> Choice:
         """Choose velocities to aim for, for the robot at a pose (x, y, yaw) that drives at `now`.
 
-        top_speed in m/s. walkers: people (k, 4) to keep clear of, at the moment of the pose. wedged: metres of room
-        that do where the robot can move no more with what it has.
+        top_speed in m/s. walkers: people (k, 4) to keep clear of, at the moment of the pose. tolerated: metres of
+        room that do for a robot that cannot move otherwise, as `tolerated` says.
         """
         speeds, turns = self._samples
         reverse = [-min(self.limits.reverse, top_speed)]
@@ -301,15 +302,15 @@ class DynamicWindow:
             around,
             self._body,
             self.padding,
-            wedged,
+            tolerated,
             way,
             walkers,
         )
         self._turn_before = turn
         return Choice(Twist(speed, turn), trajectory, best)
 
-    def wedged(self, pose: tuple[float, float, float], around: Surroundings) -> float:
-        """Return the metres of room with which a robot that can move no more may try again."""
+    def tolerated(self, pose: tuple[float, float, float], around: Surroundings) -> float:
+        """Return the metres of room with which a robot at a pose (x, y, yaw) that cannot move may try again."""
         return max(room(around, self._body, COMFORT, *pose) - SLACK, 0.0)
 
     def free_steps(
@@ -320,11 +321,14 @@ class DynamicWindow:
         steps: int,
         *,
         walkers: Walkers = NOBODY,
-        wedged: float = math.inf,
+        tolerated: float = math.inf,
     ) -> int:
-        """Count the controller's periods for which a constant twist touches nothing and nobody, up to `steps`."""
+        """Count the controller's periods for which a constant twist touches nothing and nobody, up to `steps`.
+
+        walkers, tolerated: as `choose` takes them.
+        """
         x, y, yaw = pose
-        needed = least_room(self.padding, room(around, self._body, COMFORT, x, y, yaw), wedged)
+        needed = least_room(self.padding, room(around, self._body, COMFORT, x, y, yaw), tolerated)
         for step in range(steps):
             x, y, yaw = advance(x, y, yaw, twist.linear, twist.angular, STEP)
             if room(around, self._body, COMFORT, x, y, yaw) < needed:

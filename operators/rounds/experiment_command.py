@@ -19,15 +19,7 @@ import numpy as np
 from graph.errors import UserError
 from operators.rounds.report import page, summarize
 from operators.rounds.schedule import LIDAR, TRUTH, Labels, Schedule, Session
-from operators.rounds.session_command import (
-    bytes_in,
-    keep_picture,
-    launch,
-    read_json,
-    record_of,
-    verb,
-    write_json,
-)
+from operators.rounds.session_command import bytes_in, keep_picture, launch, read_json, record_of, verb, write_json
 from operators.rounds.variants import listening_graph, robot, session_graph, written
 
 MOST_DISK = 20.0  # GB
