@@ -222,6 +222,8 @@ def test_default_is_the_papers_experiment():
         (["--steps", "3"], "--steps wants 20"),
         (["--budget", "soon"], "--budget: a duration is such as"),
         (["--building", "nowhere.yaml"], "nowhere.yaml: no such building"),
+        (["--scenarios", "hard,lunar"], "no scenario 'lunar'; there are easy, extreme, hard, mapping, medium"),
+        (["--scenarios", ","], "no scenario ','; there are easy"),
         (["--tours", "A,Z"], "has no tour 'Z'; it has A, B, C, mapping"),
     ],
 )

@@ -75,7 +75,7 @@ def settings_of(args: argparse.Namespace, threads: int) -> Settings:
         raise UserError(f"--budget: {error}") from error
     building = building_file(args)
     tours, mapping = tours_of(building, args.tours)
-    scenarios = tuple(name.strip() for name in args.scenarios.split(",") if name.strip())
+    scenarios = scenarios_of(args.scenarios)
     return Settings(
         building=str(building),
         rounds=1 if args.quick else args.rounds,
@@ -100,10 +100,24 @@ def building_file(args: argparse.Namespace) -> Path:
         return Path(args.building).resolve()
     if args.quick:
         return CABIN
+    return simulator_folder() / "buildings" / "default.yaml"
+
+
+def simulator_folder() -> Path:
+    """Return the folder of the simulator. Raises UserError where it is not installed."""
     found = importlib.util.find_spec("sim")
     if found is None or not found.submodule_search_locations:
         raise UserError("the simulator is not installed; the rounds want the extra `sim`")
-    return Path(found.submodule_search_locations[0]) / "buildings" / "default.yaml"
+    return Path(found.submodule_search_locations[0])
+
+
+def scenarios_of(wanted: str) -> tuple[str, ...]:
+    """Return the scenarios of the rounds. Raises UserError by name."""
+    scenarios = tuple(name.strip() for name in wanted.split(",") if name.strip())
+    known = sorted(path.stem for path in (simulator_folder() / "scenarios").glob("*.yaml"))
+    if not scenarios or (missing := [name for name in scenarios if name not in known]):
+        raise UserError(f"there is no scenario {(missing[0] if scenarios else wanted)!r}; there are {', '.join(known)}")
+    return scenarios
 
 
 def tours_of(building: Path, wanted: str | None) -> tuple[tuple[str, ...], str]:
