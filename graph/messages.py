@@ -123,6 +123,7 @@ class Tracks(Message, frozen=True, kw_only=True, eq=False):
     position: Annotated[Array, array("float64", "k", 2, unit="m", frame="world")]
     velocity: Annotated[Array, array("float64", "k", 2, unit="m/s", frame="world")]
     unseen: Annotated[Array, array("float32", "k", unit="s", about="since the last sighting")]
+    blind: float = 1.15  # metres from the lidar: nearer, people may go unseen
 
 
 class Truth(Message, frozen=True, kw_only=True, eq=False):

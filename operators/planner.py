@@ -7,6 +7,7 @@ planner:
   config: {people: predict}
 
 Where people are predicted and frames are classified, it wants `tracks` and `people`: whose echoes return is not near.
+Where the tracker has a second sensor, it goes by the tracks alone.
 """
 
 from __future__ import annotations
@@ -130,7 +131,7 @@ class Planner(Operator):
             where = self._pose_at(frame.measured_at)
             if where is not None:
                 self.navigator.observe(frame.points, where, frame.base_from_lidar)
-                if self.config.people == "predict":
+                if self.config.people == "predict" and (self._tracks is None or self._tracks.blind > 0.0):
                     things = self.navigator.costmap.standing(float(where[0, 3]), float(where[1, 3]), BLIND)
                     people = [other.points for other in self._people if other.measured_at == frame.measured_at]
                     if people or frame.label is None:  # else nobody knows which rays people gave back
@@ -155,6 +156,8 @@ class Planner(Operator):
         seconds = (time - self._tracks.measured_at) * 1e-9 + self.config.latency
         places = self._tracks.position + seconds * self._tracks.velocity
         walkers = np.concatenate([places, self._tracks.velocity], axis=1)
+        if self._tracks.blind == 0.0:
+            return walkers
         return self._presence.company(self._tracks.identity, walkers, self._tracks.unseen)
 
     def _pose_at(self, time: int) -> Matrix | None:

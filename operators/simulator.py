@@ -22,7 +22,7 @@ import numpy as np
 from graph.contract import End, Operator, Summary
 from graph.geometry import Matrix
 from graph.messages import Drive, Goal, Odometry, Plan, PointCloud, Pose, Tick, Truth
-from sim.lidar import LidarSpec
+from sim.lidar import Lidar, LidarSpec
 from sim.odometry import OdometryNoise
 from sim.referee import Referee
 from sim.rehearsal import rehearse
@@ -42,7 +42,8 @@ class Simulator(Operator):
         scenario: str = "easy"  # name or file
         tour: str = "A"
         seed: int = 0
-        lidar: str | LidarSpec = "paper"  # a preset (paper, hdl32e), or the paper's with other measures
+        lidar: str | LidarSpec = "paper"  # a preset (paper, hdl32e, blindspot), or the paper's with other measures
+        near: str | LidarSpec | None = None  # a second one for the first's blind ring: blindspot, or other measures
         rolling: bool | None = None  # columns one after the other over the scan period; None: as the lidar says
         dropout: float | None = None  # share of returns lost at grazing incidence and far away, at most
         odometry: OdometryNoise = OdometryNoise()
@@ -56,6 +57,7 @@ class Simulator(Operator):
         odometry: Odometry | None = None
         goal: Goal | None = None
         truth: Truth | None = None
+        near: PointCloud | None = None  # what the second lidar sees, if there is one
 
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
@@ -66,6 +68,7 @@ class Simulator(Operator):
             c.tour,
             c.seed,
             lidar=c.lidar,
+            near=c.near,
             rolling=c.rolling,
             dropout=c.dropout,
             odometry=c.odometry,
@@ -99,18 +102,8 @@ class Simulator(Operator):
         self.poses = {stamp: pose for stamp, pose in self.poses.items() if stamp > now - REMEMBERED}
         self.poses[now] = state.world_from_base
         verdict = self.referee.watch(now / SECOND, state.world_from_base)
-        scan = world.scan()
         yield self.Outputs(
-            frame=PointCloud(
-                measured_at=now,
-                points=scan.points,
-                base_from_lidar=world.base_from_lidar(),
-                ring=scan.ring,
-                time_offset=scan.time_offset,
-                truth=scan.truth,
-                moving=scan.moving,
-                instance=scan.instance,
-            ),
+            frame=self.cloud(world.lidar, now),
             odometry=Odometry(
                 measured_at=now,
                 odom_from_base=state.odom_from_base,
@@ -127,9 +120,24 @@ class Simulator(Operator):
                 people_instance=state.people_instance,
                 contacts=state.contacts,
             ),
+            near=None if world.near is None else self.cloud(world.near, now),
         )
         if verdict:
             yield End(verdict)
+
+    def cloud(self, lidar: Lidar, now: int) -> PointCloud:
+        """Scan with one of the robot's lidars."""
+        scan = self.world.scan(lidar)
+        return PointCloud(
+            measured_at=now,
+            points=scan.points,
+            base_from_lidar=self.world.base_from_lidar(lidar),
+            ring=scan.ring,
+            time_offset=scan.time_offset,
+            truth=scan.truth,
+            moving=scan.moving,
+            instance=scan.instance,
+        )
 
     def on_drive(self, drive: Drive) -> None:
         """Obey from now on, which is seen at the next tick."""

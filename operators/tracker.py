@@ -2,7 +2,10 @@
 
 tracker:
   run: operators.tracker:Tracker
-  inputs: {people: triage/people, pose: localizer/pose}
+  inputs: {people: triage/people, near: simulator/near, obstacles: triage/planning, pose: localizer/pose}
+
+`near`, of a second sensor for the ring in which the lidar is blind, may be left out, and `obstacles` with it. Nobody
+labels its points: there, what stands where the lidar saw no obstacle before is a person.
 """
 
 from __future__ import annotations
@@ -11,17 +14,25 @@ from collections import deque
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from graph.contract import Operator, Summary
 from graph.geometry import planar, transform
 from graph.messages import PointCloud, Pose, Tracks
 from operators.pointmap.rehearsal import room_scan
-from operators.tracking.tracker import Habits
+from operators.tracking.things import Things
+from operators.tracking.tracker import Habits, looking
 from operators.tracking.tracker import Tracker as Tracking
 
 SECOND = 1_000_000_000  # nanoseconds
 WAITING = 10  # frames kept until their pose is known
 LOWEST, HIGHEST = 0.1, 2.1  # metres above the floor between which people are
+NEAR = 1.2  # metres from the lidar: nearer, it shows but a part of somebody, and a second sensor all
+THINGS = 3.0  # metres from the lidar within which obstacles are remembered
+
+
+Frames = deque[PointCloud]
+Floats = npt.NDArray[np.float64]
 
 
 class Tracker(Operator):
@@ -42,8 +53,12 @@ class Tracker(Operator):
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
         c: Tracker.Config = self.config
-        self.tracking = Tracking(Habits(reach=c.reach, forgotten=c.forgotten, blind_for=c.blind_for))
-        self._frames: deque[PointCloud] = deque(maxlen=WAITING)
+        self.habits = Habits(reach=c.reach, forgotten=c.forgotten, blind_for=c.blind_for)
+        self.tracking = Tracking(self.habits)
+        self.things = Things()
+        self._people: Frames = deque(maxlen=WAITING)
+        self._near: Frames = deque(maxlen=WAITING)
+        self._obstacles: Frames = deque(maxlen=WAITING)
         self._last: int | None = None
         self.frames, self.followed = 0, 0
 
@@ -53,28 +68,44 @@ class Tracker(Operator):
         rehearsed = cls()
         for stamp in (0, SECOND // 10):
             cloud = PointCloud(measured_at=stamp, points=room_scan(), base_from_lidar=planar(0.0, 0.0, 0.0, 0.64))
-            rehearsed.on_people(cloud)
+            for listen in (rehearsed.on_people, rehearsed.on_near, rehearsed.on_obstacles):
+                listen(cloud)
             rehearsed.on_pose(Pose(measured_at=stamp, world_from_base=np.eye(4)))
+
+    @classmethod
+    def missing(cls, config: Config, wired: frozenset[str]) -> str:
+        """Warn where a second sensor's points would all be people's."""
+        if "near" in wired and "obstacles" not in wired:
+            return "near wants obstacles wired; without, all that stands near the robot is taken for people"
+        return ""
 
     def on_people(self, cloud: PointCloud) -> None:
         """Keep a frame until it is known where it was taken."""
-        self._frames.append(cloud)
+        self._people.append(cloud)
+
+    def on_near(self, cloud: PointCloud | None) -> None:
+        assert cloud is not None
+        self._near.append(cloud)
+
+    def on_obstacles(self, cloud: PointCloud | None) -> None:
+        assert cloud is not None
+        self._obstacles.append(cloud)
 
     def on_pose(self, pose: Pose) -> Outputs | None:
         """Look at the frame of this pose. Frames whose pose never comes are left out."""
-        while self._frames and self._frames[0].measured_at < pose.measured_at:
-            self._frames.popleft()
-        if not self._frames or self._frames[0].measured_at > pose.measured_at:
+        cloud, near, obstacles = (_of(frames, pose) for frames in (self._people, self._near, self._obstacles))
+        if cloud is None:
             return None
-        cloud = self._frames.popleft()
-        world_from_lidar = pose.world_from_base @ cloud.base_from_lidar
-        points = transform(world_from_lidar, cloud.points.astype(np.float64))
-        above = points[:, 2] - pose.world_from_base[2, 3]
-        points = points[(above > LOWEST) & (above < HIGHEST)]
+        eye = (pose.world_from_base @ cloud.base_from_lidar)[:2, 3]
+        points = _standing(cloud, pose)
+        self.tracking.habits = self.habits
+        if near is not None:
+            self.tracking.habits = looking(self.habits)
+            points = points[_away(points, eye) >= NEAR]
+            points = np.concatenate([points, self._unexplained(near, obstacles, pose)])
         seconds = 0.0 if self._last is None else (pose.measured_at - self._last) / SECOND
         self._last = pose.measured_at
-        eye = float(world_from_lidar[0, 3]), float(world_from_lidar[1, 3])
-        people = self.tracking.observe(points, eye, seconds)
+        people = self.tracking.observe(points, (float(eye[0]), float(eye[1])), seconds)
         self.frames += 1
         self.followed += len(people.identity)
         return self.Outputs(
@@ -84,9 +115,40 @@ class Tracker(Operator):
                 position=people.place,
                 velocity=people.velocity,
                 unseen=people.unseen.astype(np.float32),
+                blind=self.tracking.habits.blind,
             )
         )
+
+    def _unexplained(self, near: PointCloud, obstacles: PointCloud | None, pose: Pose) -> Floats:
+        """Return the second sensor's points (n, 3; world) at nothing that is known to stand there."""
+        seconds = pose.measured_at / SECOND
+        if obstacles is not None:
+            places = transform(pose.world_from_base @ obstacles.base_from_lidar, obstacles.points.astype(np.float64))
+            close = _away(places, pose.world_from_base[:2, 3]) < THINGS
+            self.things.observe(places[close, :2], seconds)
+        points = _standing(near, pose)
+        points = points[_away(points, (pose.world_from_base @ near.base_from_lidar)[:2, 3]) < NEAR]
+        return np.asarray(points[~self.things.explain(points[:, :2], seconds)])
 
     def on_end(self) -> Summary:
         """Tell how many people were met, and how many were followed at once."""
         return Summary(people_met=self.tracking.met, people_followed=self.followed / max(1, self.frames))
+
+
+def _of(frames: Frames, pose: Pose) -> PointCloud | None:
+    """Take the frame of a pose's time out of those that wait, and those before it."""
+    while frames and frames[0].measured_at < pose.measured_at:
+        frames.popleft()
+    return frames.popleft() if frames and frames[0].measured_at == pose.measured_at else None
+
+
+def _standing(cloud: PointCloud, pose: Pose) -> Floats:
+    """Return the points (n, 3; world, metres) at the height of people."""
+    points = transform(pose.world_from_base @ cloud.base_from_lidar, cloud.points.astype(np.float64))
+    above = points[:, 2] - pose.world_from_base[2, 3]
+    return np.asarray(points[(above > LOWEST) & (above < HIGHEST)])
+
+
+def _away(points: Floats, eye: Floats) -> Floats:
+    """Return the distances (n,) of points (n, 3) from a place (2,) on the floor, metres."""
+    return np.asarray(np.hypot(points[:, 0] - eye[0], points[:, 1] - eye[1]))

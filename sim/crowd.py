@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from sim.clearance import Clearance
 from sim.figure import walking
-from sim.steering import STAND, STAND_SHARE, walk
+from sim.steering import FOOT, ROBOT, STAND, STAND_SHARE, walk
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -18,6 +18,8 @@ ASIDE = 1.0  # radians by which that point may be off the robot's heading
 KEPT = 5.0  # seconds, on average, until a follower chooses another such point
 TURN_RATE = 4.0  # rad/s at which a body turns to where it goes
 MOVES = 0.1  # m/s above which a body counts as moving
+FIRST_STEP = 0.4  # metres after which who starts to walk takes full strides
+SETTLING = 0.3  # seconds in which the feet of who stops come together
 
 
 class Crowd:
@@ -36,7 +38,9 @@ class Crowd:
         self.attentive = rng.random(count) < attentive
         self.pace = np.clip(rng.normal(0.92, 0.06, count), 0.75, 1.0)  # m/s
         self.height, self.build = stature(count, rng)
+        self.kept = ROBOT + FOOT * self.height  # metres from the robot's middle
         self.velocity = np.zeros((count, 2))
+        self.swing = np.zeros(count)  # share of a full stride that they have come to
         self.walked = rng.uniform(0.0, 2.0, count)  # metres, so that not all feet are in step
         self.standing = np.where(rng.random(count) < STAND_SHARE, rng.uniform(*STAND, count), 0.0) * ~following
         self.offset = self._offsets()
@@ -62,10 +66,12 @@ class Crowd:
             draws = np.stack([self.rng.standard_normal(count), self.rng.random(count), self.rng.uniform(*STAND, count)])
             walk(
                 self.position, self.velocity, self.heading, self.standing, follows, self.attentive,
-                self.pace, aim, draws, place, free.distance, low, free.resolution, step,
+                self.pace, aim, draws, place, self.kept, free.distance, low, free.resolution, step,
             )  # fmt: skip
             pace = np.hypot(*self.velocity.T)
             self.walked += pace * step
+            slower = np.maximum(0.0, self.swing - step / SETTLING)
+            self.swing = np.where(pace > MOVES, np.minimum(1.0, self.swing + pace * step / FIRST_STEP), slower)
             went = np.arctan2(self.velocity[:, 1], self.velocity[:, 0])
             turn = np.where(pace > 0.15, went - self.facing, 0.0)
             self.facing += np.clip((turn + np.pi) % (2 * np.pi) - np.pi, -TURN_RATE * step, TURN_RATE * step)
@@ -81,7 +87,7 @@ class Crowd:
 
     def stride_share(self) -> Array:
         """Return how much of the walking pose each shows: 1 at full pace, 0 standing."""
-        return np.asarray(np.clip(np.hypot(*self.velocity.T) / 0.6, 0.0, 1.0))
+        return np.asarray(np.clip(np.hypot(*self.velocity.T) / 0.6, 0.0, self.swing))
 
     def phase(self) -> Array:
         """Return the gait's phase: the distance walked over the length of a stride."""

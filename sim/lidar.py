@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from graph.geometry import inverse
 from sim import capsules
+from sim.building import BuildingError
 from sim.engines import EmbreeScene, TriangleMesh
 
 Array = npt.NDArray[np.float64]
@@ -34,6 +35,7 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     dropout: float = 0.0  # share lost at grazing incidence and far away, at most
 
 
+# blindspot: a hemispherical sensor of the kind sold for the floor around a robot, sparse, and blind nowhere.
 # hdl32e: angles, columns at 10 Hz, range and its step are the data sheet's. The noise is a real sensor's: in a capture,
 # nine firings of one beam in a row scatter by 4.5 mm (median, 3 to 10 m away) about a smooth curve.
 PRESETS = {
@@ -41,7 +43,17 @@ PRESETS = {
     "hdl32e": LidarSpec(
         columns=2170, lowest=-30.67, highest=10.67, nearest=0.9, farthest=70.0, noise=0.005, step=0.002
     ),
+    "blindspot": LidarSpec(beams=16, columns=180, lowest=-50.0, highest=30.0, nearest=0.1, farthest=2.0, noise=0.01),
 }
+
+
+def lidar_named(lidar: str | LidarSpec) -> LidarSpec:
+    """Return a preset by its name, or the measures given. Raises BuildingError for a name that there is not."""
+    if isinstance(lidar, LidarSpec):
+        return lidar
+    if lidar not in PRESETS:
+        raise BuildingError(f"there is no lidar {lidar!r}; there are {', '.join(PRESETS)}")
+    return PRESETS[lidar]
 
 
 class People(NamedTuple):

@@ -20,7 +20,9 @@ Flags = npt.NDArray[np.bool_]
 MARGIN = 0.5  # metres: people and obstacles push within it
 BODY = 0.22  # metres: half the breadth of a person
 ROBOT = 0.27  # metres: half the diagonal of the robot
-REACH = 0.75  # metres from the robot's middle within which nobody steps nearer: its half length, and a stride
+FOOT = (
+    0.31  # of a person's height, by which feet reach ahead of the hips: with ROBOT, nobody steps nearer to its middle
+)
 BREATH = 0.38  # metres between the middles of two people, at the least
 TURNING = 0.6  # rad/sqrt(s), of a wanderer's heading
 STAND_SHARE = 0.2  # of its time that a wanderer stands
@@ -81,6 +83,7 @@ def walk(
     aim: Array,
     draws: Array,
     robot: Array,
+    kept: Array,
     distance: Array,
     low: Array,
     resolution: float,
@@ -89,8 +92,9 @@ def walk(
     """Move all walkers by one update; position, velocity (n, 2), heading and standing (n,) are changed in place.
 
     standing: seconds that a wanderer still stands. follows: who follows the robot just now, to its
-    aim (n, 2). draws: (3, n): normal, uniform 0 to 1, uniform over STAND. robot: x, y. distance: clearance in
-    metres of cells of `resolution` from `low`. Metres, radians, m/s.
+    aim (n, 2). draws: (3, n): normal, uniform 0 to 1, uniform over STAND. robot: x, y. kept: (n,) from its middle
+    within which nobody steps nearer. distance: clearance in metres of cells of `resolution` from `low`. Metres,
+    radians, m/s.
     """
     count = len(position)
     rows, columns = distance.shape
@@ -143,7 +147,7 @@ def walk(
         ax, ay = x - robot[0], y - robot[1]
         apart = max(math.hypot(ax, ay), 0.05)
         gap = max(apart - ROBOT - BODY, 0.05)
-        if attentive[i] and gap < (0.5 * MARGIN if follows[i] else MARGIN):
+        if attentive[i] and gap < MARGIN:
             push = min(ROBOT_PUSH / gap**2, STRONGEST) / apart
             px, py = px + push * ax, py + push * ay
         pressed = math.hypot(px, py)
@@ -159,7 +163,7 @@ def walk(
             there = sample(distance, (nx - low[0]) / resolution, (ny - low[1]) / resolution)
             free = there >= BODY or there > here
             reach = math.hypot(nx - robot[0], ny - robot[1])
-            free = free and (reach > REACH or reach >= apart)
+            free = free and (reach > kept[i] or reach >= apart)
             for n in range(found):
                 between = math.hypot(nx - old[near[n], 0], ny - old[near[n], 1])
                 free = free and (between > BREATH or between >= math.hypot(x - old[near[n], 0], y - old[near[n], 1]))

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graph.geometry import planar, wrap, yaw
-from sim.building import Building, BuildingError
+from sim.building import Building
 from sim.building_file import load
 from sim.clearance import clearance, length_of
 from sim.crowd import Crowd, spots, stature
@@ -24,7 +24,7 @@ from sim.figure import figures, placed, radii, sitting
 from sim.furniture import SEAT_HEIGHT
 from sim.inspection import require
 from sim.layout import RESOLUTION, Seat, draw
-from sim.lidar import NOTHING, PRESETS, Hits, Lidar, LidarSpec, People
+from sim.lidar import NOTHING, Hits, Lidar, LidarSpec, People, lidar_named
 from sim.odometry import Odometer, OdometryNoise
 from sim.physics import GLIDE, SUBSTEP, Physics
 from sim.scenario import Scenario, load_scenario
@@ -79,6 +79,7 @@ class State(NamedTuple):
 class World:
     """A session, fixed to the bit by building, scenario, tour and seed. Raises BuildingError for bad input, by name.
 
+    near: a second lidar for the ring in which the first is blind, if there is one.
     Instances are the indices of `bodies` (0 is the floor), then the walkers, then the sitters.
     """
 
@@ -90,18 +91,16 @@ class World:
         seed: int,
         *,
         lidar: str | LidarSpec = "paper",
+        near: str | LidarSpec | None = None,
         rolling: bool | None = None,
         dropout: float | None = None,
         odometry: OdometryNoise | None = None,
     ) -> None:
         self.building: Building = building if isinstance(building, Building) else load(building)
         self.scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
-        if isinstance(lidar, str):
-            if lidar not in PRESETS:
-                raise BuildingError(f"there is no lidar {lidar!r}; there are {', '.join(PRESETS)}")
-            lidar = PRESETS[lidar]
         changes = {"rolling": rolling, "dropout": dropout}
-        self.spec = msgspec.structs.replace(lidar, **{name: v for name, v in changes.items() if v is not None})
+        changes = {name: value for name, value in changes.items() if value is not None}
+        self.spec = msgspec.structs.replace(lidar_named(lidar), **changes)
         self.start = self.building.start_pose(tour)
         require(self.building, [tour])
         self.targets = np.array(self.building.tours[tour].targets, np.float64).reshape(-1, 2)
@@ -110,8 +109,10 @@ class World:
         self.bodies = [self._floor(), *self.layout.bodies]
         triangles, owner = triangles_of(self.bodies)
         self.lidar = Lidar(self.spec, triangles, owner)
+        self.near = None if near is None else Lidar(lidar_named(near), triangles, owner)
         self.physics = Physics(self.layout.bodies, self.start)
         self.noise = np.random.default_rng([seed, 3])
+        self.noise_near = np.random.default_rng([seed, 5])
         shadows = [_shadow(seat) for seat in self.layout.seats]
         self.free = clearance(self.layout.bodies + shadows, self.building.bounds(), RESOLUTION)
         self._rooms()
@@ -233,7 +234,7 @@ class World:
                 self.physics.step()
                 still, people = self.physics.contacts()
                 touched |= {1 + body for body in still} | {len(self.bodies) + person for person in people}
-            if self.spec.rolling:
+            if self.spec.rolling or (self.near is not None and self.near.spec.rolling):
                 self.trail.append(self.physics.motion().world_from_base)
         self.time += seconds
         self.elapsed = seconds
@@ -250,44 +251,46 @@ class World:
             self.touched[instance] = self.time
         self.touching = np.array(sorted(touched), np.int32)
 
-    def base_from_lidar(self) -> Array:
-        """Return the sensor's place on the robot (4, 4)."""
-        return planar(0.0, 0.0, 0.0, self.spec.height)
+    def base_from_lidar(self, lidar: Lidar | None = None) -> Array:
+        """Return the place of the lidar, or of `near`, on the robot (4, 4)."""
+        return planar(0.0, 0.0, 0.0, (lidar or self.lidar).spec.height)
 
-    def sensor(self) -> tuple[Array, Array]:
+    def sensor(self, lidar: Lidar) -> tuple[Array, Array]:
         """Return world_from_lidar (4, 4), or (columns, 4, 4), and each column's share of the last step."""
-        mount = self.base_from_lidar()
-        if not self.spec.rolling or self.elapsed == 0.0:
-            return self.motion.world_from_base @ mount, np.ones(self.spec.columns)
-        share = 1.0 - (1.0 - self.lidar.share) * min(1.0, 1.0 / self.spec.rate / self.elapsed)
+        mount = self.base_from_lidar(lidar)
+        if not lidar.spec.rolling or self.elapsed == 0.0:
+            return self.motion.world_from_base @ mount, np.ones(lidar.spec.columns)
+        share = 1.0 - (1.0 - lidar.share) * min(1.0, 1.0 / lidar.spec.rate / self.elapsed)
         return along(np.array(self.trail), share) @ mount, share
 
-    def scan(self) -> Frame:
-        """Scan from where the robot is; a rolling scan began one period ago and ends now."""
-        pose, share = self.sensor()
-        hits = self.lidar.shoot(pose, share, self.people())
+    def scan(self, lidar: Lidar | None = None) -> Frame:
+        """Scan with the lidar, or with `near`, from where the robot is; a rolling scan began a period ago, ends now."""
+        lidar = lidar or self.lidar
+        noise = self.noise if lidar is self.lidar else self.noise_near
+        pose, share = self.sensor(lidar)
+        hits = lidar.shoot(pose, share, self.people())
         if pose.ndim == 3:
-            pose = pose[self.lidar.column]
-            heights = np.einsum("ni,ni->n", pose[:, 2, :3], self.lidar.directions) * hits.distance + pose[:, 2, 3]
+            pose = pose[lidar.column]
+            heights = np.einsum("ni,ni->n", pose[:, 2, :3], lidar.directions) * hits.distance + pose[:, 2, 3]
         else:
-            heights = (self.lidar.directions @ pose[2, :3]) * hits.distance + pose[2, 3]
-        return self._frame(hits, heights)
+            heights = (lidar.directions @ pose[2, :3]) * hits.distance + pose[2, 3]
+        return self._frame(lidar, noise, hits, heights)
 
     def people(self) -> People:
         """Return everybody's capsules before and after the last step."""
         return People(self.bodies_before, self.capsules, self.radii, len(self.bodies))
 
-    def _frame(self, hits: Hits, heights: Array) -> Frame:
+    def _frame(self, lidar: Lidar, noise: np.random.Generator, hits: Hits, heights: Array) -> Frame:
         """Add noise, drop what the sensor does not see, and label what is left."""
-        spec = self.spec
-        measured = hits.distance + np.float32(spec.noise) * self.noise.standard_normal(len(hits.distance), np.float32)
+        spec = lidar.spec
+        measured = hits.distance + np.float32(spec.noise) * noise.standard_normal(len(hits.distance), np.float32)
         if spec.step > 0:
             measured = np.round(measured / np.float32(spec.step)) * np.float32(spec.step)
         keep = (hits.body != NOTHING) & (measured >= spec.nearest) & (measured <= spec.farthest)
         if spec.dropout > 0:
             grazing = np.clip(1.0 - hits.cosine / 0.26, 0.0, 1.0)  # beyond 75 degrees of incidence
             far = np.clip(hits.distance / spec.farthest - 0.5, 0.0, 0.5) * 2.0
-            keep &= self.noise.random(len(keep), np.float32) >= spec.dropout * np.maximum(grazing, far)
+            keep &= noise.random(len(keep), np.float32) >= spec.dropout * np.maximum(grazing, far)
         kept = np.flatnonzero(keep)
         body = hits.body[kept]
         truth = self.truth[body]
@@ -296,10 +299,10 @@ class World:
         moves[len(self.bodies) : len(self.bodies) + len(self.crowd.position)] = self.crowd.moving()
         offset = None
         if spec.rolling:
-            offset = ((self.lidar.share[self.lidar.column[kept]] - 1.0) / spec.rate).astype(np.float32)
+            offset = ((lidar.share[lidar.column[kept]] - 1.0) / spec.rate).astype(np.float32)
         return Frame(
-            points=(self.lidar.directions[kept] * measured[kept, None]).astype(np.float32),
-            ring=self.lidar.ring[kept],
+            points=(lidar.directions[kept] * measured[kept, None]).astype(np.float32),
+            ring=lidar.ring[kept],
             time_offset=offset,
             truth=truth,
             moving=moves[body],

@@ -15,6 +15,7 @@ from operators.navigation.footprint import Footprint, Surroundings
 from operators.navigation.lattice import Lattice
 from operators.navigation.motion import Twist, advance, towards
 from operators.navigation.people import (
+    AHEAD,
     BELIEVED,
     BODY,
     COMES,
@@ -22,9 +23,16 @@ from operators.navigation.people import (
     COMING_COST,
     COMING_ROOM,
     EASY,
+    KEPT,
+    LAG,
     NOBODY,
+    REMEMBERED,
+    SAME,
     STRIDE,
+    STUBBORN,
     WALK,
+    Stubborn,
+    crowd,
     nearby,
     person_room,
     surcharge,
@@ -35,6 +43,7 @@ from operators.navigation.window import DynamicWindow, Limits, way_around
 
 OPEN = Surroundings(np.full((80, 80), 1.0, np.float32), 0.05, -2.0, -2.0)
 RADIUS = Footprint().circumscribed
+HALF = Footprint().body().half
 numbers = st.floats(-3.0, 3.0)
 walkers = st.lists(st.tuples(numbers, numbers, st.floats(-1, 1), st.floats(-1, 1)), max_size=5).map(
     lambda rows: np.array(rows, np.float64).reshape(-1, 4)
@@ -53,44 +62,114 @@ def choose(people, *, now=None, window=None):
     return window.choose((0.0, 0.0, 0.0), now or Twist(), OPEN, way_ahead(), top_speed=1.3, walkers=np.array(people))
 
 
-@given(walkers, numbers, numbers, st.floats(0.0, 2.0))
+def outside(place, pose):
+    """Plain twin: from a place (2,) to the nearest point of the robot's rectangle; to it, and how far, in its frame."""
+    cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+    ahead, aside = place[0] - pose[0], place[1] - pose[1]
+    local = np.array([cosine * ahead + sine * aside, cosine * aside - sine * ahead])
+    nearest = np.clip(local, (-HALF[0], -HALF[1]), HALF)
+    return nearest, local - nearest
+
+
+@given(walkers, numbers, numbers, st.floats(-math.pi, math.pi), st.floats(0.0, 2.0))
 @settings(max_examples=100, deadline=None)
-def test_room_is_that_to_the_nearest_who_goes_on_or_has_stopped(people, x, y, seconds):
+def test_room_is_that_to_the_nearest_who_goes_on_or_has_stopped(people, x, y, turned, seconds):
     least = math.inf
     for row in people:
-        standing = math.dist(row[:2], (x, y))
         speed = float(np.hypot(*row[2:]))
-        feet = np.linspace(-1.0, 1.0, 401)[:, None] * STRIDE * min(1.0, speed / WALK)
+        feet = np.linspace(-1.0, 1.0, 4001)[:, None] * STRIDE * min(1.0, speed / WALK)
         ahead = row[2:] / speed if speed > 1e-6 else np.array([1.0, 0.0])
-        going = np.hypot(*(row[:2] + seconds * row[2:] + feet * ahead - (x, y)).T).min()
-        least = min(least, standing - BODY, float(going) - BODY)
-    found, along, across = person_room(people, seconds, x, y)
+        going = row[:2] + seconds * row[2:] + feet * ahead
+        going = going[np.argmin(np.hypot(*(going - (x, y)).T))]  # of its feet the one nearest to the robot's middle
+        for place in (row[:2] - LAG * row[2:], going):
+            least = min(least, float(np.hypot(*outside(place, (x, y, turned))[1])) - BODY)
+    found, along, across, front, side = person_room(people, HALF, seconds, x, y, turned)
     assert found == pytest.approx(least, abs=2e-3)
     assert math.hypot(along, across) == pytest.approx(1.0)
+    assert abs(front) <= HALF[0]
+    assert abs(side) <= HALF[1]
+
+
+def driving(people, speed, *, turn=0.0, seconds=0.5, turned=0.0):
+    return toll(np.array(people).reshape(-1, 4), HALF, seconds, (0.0, 0.0, turned), speed, turn, 1.3)
+
+
+def ahead(room):
+    return [[HALF[0] + BODY + room, 0.0, 0.0, 0.0]]
 
 
 def test_far_from_everybody_is_free():
-    person = np.array([[RADIUS + BODY + EASY + 0.01, 0.0, 0.0, 0.0]])
-    assert toll(person, RADIUS, 0.5, 0.0, 0.0, 0.0, 1.0, 1.3) == (0.0, False)
-    assert toll(NOBODY, RADIUS, 0.5, 0.0, 0.0, 0.0, 1.0, 1.3) == (0.0, False)
+    assert driving(ahead(EASY + 0.01), 1.0) == (0.0, False)
+    assert driving([], 1.0) == (0.0, False)
 
 
 def test_only_those_whom_the_robot_approaches_are_driven_into():
-    person = np.array([[RADIUS + BODY, 0.0, 0.0, 0.0]])
-    assert toll(person, RADIUS, 0.5, 0.0, 0.0, 0.0, 0.5, 1.3)[1]
-    assert not toll(person, RADIUS, 0.5, 0.0, 0.0, 0.0, -0.2, 1.3)[1]
-    assert not toll(person, RADIUS, 0.5, 0.0, 0.0, 0.0, 0.0, 1.3)[1]
-    assert not toll(person, RADIUS, 0.5, 0.0, 0.0, math.pi / 2, 0.5, 1.3)[1]
+    assert driving(ahead(0.0), 0.5)[1]
+    assert not driving(ahead(0.0), -0.2)[1]
+    assert not driving(ahead(0.0), 0.0)[1]
+    assert not driving([[0.0, HALF[1] + BODY, 0.0, 0.0]], 0.5)[1]  # past somebody beside it
+    assert not driving(ahead(0.0), 0.5, turned=math.pi)[1]
+
+
+def test_a_corner_that_turns_into_somebody_is_driven_into_them():
+    corner = [[HALF[0], HALF[1] + BODY + 0.05, 0.0, 0.0]]  # beside the front, on the left
+    assert driving(corner, 0.0, turn=1.0)[1]
+    assert not driving(corner, 0.0, turn=-1.0)[1]
+
+
+@given(st.floats(0.05, 1.3), st.floats(0.0, 0.5))
+def test_the_faster_the_robot_comes_the_more_room_it_leaves(speed, room):
+    assert driving(ahead(room), speed)[1] == (room < KEPT + AHEAD * speed) or room == pytest.approx(
+        KEPT + AHEAD * speed
+    )
 
 
 def test_toll_falls_with_distance_and_with_time():
-    def cost(distance, seconds=0.3):
-        person = np.array([[RADIUS + BODY + distance, 0.0, 0.0, 0.0]])
-        return toll(person, RADIUS, seconds, 0.0, 0.0, 0.0, 0.8, 1.3)[0]
+    costs = [driving(ahead(room), 0.8, seconds=0.3)[0] for room in (0.3, 0.36, 0.42, 0.48)]
+    assert all(near > far > 0.0 for near, far in itertools.pairwise(costs))
+    assert driving(ahead(0.3), 0.8, seconds=1.5)[0] < driving(ahead(0.3), 0.8, seconds=0.3)[0]
 
-    costs = [cost(distance) for distance in (0.1, 0.2, 0.3, 0.4)]
-    assert all(near > far for near, far in itertools.pairwise(costs))
-    assert cost(0.2, 1.5) < cost(0.2, 0.3)
+
+def weights_among(people, *, stays=False):
+    weights = np.full((40, 40), 8, np.int32)
+    weights[:, 0] = 0  # blocked
+    walkers = np.array(people, np.float64).reshape(-1, 4)
+    crowd(weights, 0.1, -2.0, -2.0, walkers, np.full(len(walkers), stays))
+    return weights
+
+
+def test_a_way_past_people_costs_more_and_what_is_blocked_stays_so():
+    alone = weights_among([])
+    assert (alone[:, 1:] == 8).all()
+    standing = weights_among([[1.0, 0.0, 0.0, 0.0]])
+    assert (standing[:, 0] == 0).all()
+    assert standing[20, 30] == 8 + 8
+    assert 8 < standing[20, 24] < 8 + 8
+    assert (standing[:, 1:20] == 8).all()  # 1 m away and more
+    walking = weights_among([[1.0, 0.0, 0.0, 0.9]])
+    assert 8 < walking[24, 30] < 8 + 8  # soon there, and soon gone
+    assert walking[20, 30] < standing[20, 30]
+
+
+def test_who_does_not_step_aside_is_gone_around():
+    assert weights_among([[0.6, 0.0, 0.0, 0.0]], stays=True)[20, 26] > 500
+    assert weights_among([[0.6, 0.0, 0.0, 0.0]])[20, 26] <= 16
+
+
+def test_who_stands_near_is_remembered_and_followed_and_forgotten():
+    stubborn = Stubborn()
+    there, passing = [STUBBORN - 0.1, 0.0, 0.0, 0.0], [0.0, STUBBORN - 0.1, 0.9, 0.0]
+    far = [3.0, 0.0, 0.0, 0.0]
+    assert stubborn.among(np.array([far, there, passing]), (0.0, 0.0)).tolist() == [False, True, False]
+    assert stubborn.among(np.array([there, far]), (-5.0, 0.0)).tolist() == [True, False]  # though the robot has left
+    assert stubborn.among(NOBODY, (-5.0, 0.0)).tolist() == []  # out of sight
+    moved = [there[0] + 0.9 * SAME, 0.0, 0.0, 0.0]
+    for _ in range(REMEMBERED - 4):
+        assert stubborn.among(np.array([far, moved]), (-5.0, 0.0)).tolist() == [False, True]
+    assert [stubborn.among(np.array([moved]), (-5.0, 0.0))[0] for _ in range(4)][-1] == False  # noqa: E712
+    other = Stubborn()
+    other.among(np.array([there]), (0.0, 0.0))
+    assert not other.among(np.array([[there[0] + 2.0 * SAME, 0.0, 0.0, 0.0]]), (-5.0, 0.0)).any()  # somebody else
 
 
 def test_without_people_nothing_changes():

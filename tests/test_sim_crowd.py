@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim.clearance import Clearance, clearance
-from sim.crowd import Crowd, spots
+from sim.crowd import FIRST_STEP, Crowd, spots
 from sim.figure import PARTS, figures, placed, radii, sitting, standing, walking
 from sim.masonry import wall_bodies
-from sim.steering import BODY, BREATH, CELL, REACH, neighbours, sample
+from sim.steering import BODY, BREATH, CELL, ROBOT, neighbours, sample
 from tests.small_rooms import two_rooms
 
 Array = npt.NDArray[np.float64]
@@ -114,10 +114,36 @@ def test_attentive_people_keep_off_the_robot_and_others_do_not_step_on_it(attent
     people = crowd(10, 5, attentive=attentive)
     for _ in range(600):
         people.advance(0.1, free, (2.5, 3.0, 0.0))
-        least = min(least, float(np.hypot(*(people.position - (2.5, 3.0)).T).min()))
-    assert least > REACH - 1e-3
+        least = min(least, float((np.hypot(*(people.position - (2.5, 3.0)).T) - people.kept).min()))
+    assert least > -1e-3
     if not attentive:
-        assert least < REACH + 0.05  # they come up to it
+        assert least < 0.05  # they come up to it
+
+
+def test_nobody_kicks_a_robot_that_stands() -> None:
+    """No part of anybody comes within the circle around the robot, wherever they walk."""
+    free, people, least = floor(), crowd(14, 5, attentive=0.0, followers=6), np.inf
+    for _ in range(1200):
+        people.advance(0.1, free, (2.5, 3.0, 0.0))
+        parts = figures(people.phase(), people.stride_share(), people.height)
+        parts = placed(parts, people.position[:, 0], people.position[:, 1], people.facing)
+        away = np.hypot(parts[..., 0] - 2.5, parts[..., 1] - 3.0).min(-1) - radii(people.height, people.build)
+        least = min(least, float(away.min()))
+    assert least > ROBOT - 0.03
+    assert least < ROBOT + 0.2  # they come near
+
+
+def test_who_starts_to_walk_takes_small_steps_first() -> None:
+    free, people = floor(), crowd(1, 1)
+    people.standing[:], people.swing[:], people.velocity[:] = 0.0, 0.0, 0.0
+    shares = []
+    for _ in range(30):
+        before = people.position.copy()
+        people.advance(0.05, free, FAR)
+        shares.append((float(np.hypot(*(people.position - before)[0])), float(people.stride_share()[0])))
+    walked = np.cumsum([way for way, _ in shares])
+    assert all(share <= way / FIRST_STEP + 1e-9 for way, (_, share) in zip(walked, shares, strict=True))
+    assert shares[-1][1] == 1.0
 
 
 def test_the_same_seed_walks_the_same_way() -> None:

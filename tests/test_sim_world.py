@@ -169,7 +169,7 @@ def test_both_engines_see_the_same_bodies() -> None:
     world = World("default", "extreme", "A", 3)
     for _ in range(3):
         world.advance(0.5, 0.4)
-    pose, share = world.sensor()
+    pose, share = world.sensor(world.lidar)
     hits = world.lidar.shoot(pose, share, world.people())
     world.physics.place_people(world.capsules, world.radii, np.inf)
     directions = (world.lidar.directions @ pose[:3, :3].T).astype(np.float32).astype(np.float64)

@@ -61,7 +61,8 @@ def tick(simulator: Simulator, index: int) -> tuple[Simulator.Outputs, str]:
 def test_ports_and_their_order() -> None:
     ports = ports_of(Simulator)
     assert list(ports.inputs) == ["tick", "drive", "pose", "plan"]
-    assert ports.outputs == {"frame": PointCloud, "odometry": Odometry, "goal": Goal, "truth": Truth}
+    told = {"frame": PointCloud, "odometry": Odometry, "goal": Goal, "truth": Truth, "near": PointCloud}
+    assert ports.outputs == told
 
 
 def test_an_unreachable_target_is_skipped_once(files: tuple[Path, str]) -> None:
@@ -218,6 +219,22 @@ def test_lidar_and_odometry_are_settings(files: tuple[Path, str]) -> None:
     assert simulator.world.odometer.scale == 1.0
 
 
+def test_a_second_lidar_sees_who_is_near_and_changes_nothing_else(files: tuple[Path, str]) -> None:
+    one, two = make((files[0], "extreme"), seed=9), make((files[0], "extreme"), seed=9, near="blindspot")
+    for index in range(3):
+        for simulator in (one, two):
+            simulator.on_drive(Drive(measured_at=0, linear=0.7, angular=0.4))
+        first, second = tick(one, index)[0], tick(two, index)[0]
+        assert first.near is None
+        assert second.near is not None
+        assert second.near.measured_at == second.frame.measured_at
+        away = np.linalg.norm(second.near.points, axis=1)
+        assert 0.1 <= away.min() < 0.9
+        assert away.max() <= 2.0
+        for port in ("frame", "odometry", "goal", "truth"):
+            assert encode(getattr(first, port)) == encode(getattr(second, port))
+
+
 def test_two_simulators_of_one_config_agree_to_the_bit(files: tuple[Path, str]) -> None:
     one, two = (make((files[0], "extreme"), seed=9) for _ in range(2))
     assert len(one.world.crowd.position) == 12
@@ -235,7 +252,8 @@ def test_two_simulators_of_one_config_agree_to_the_bit(files: tuple[Path, str]) 
         ({"building": Path("castle")}, "no file castle; shipped are .*default"),
         ({"scenario": "panic"}, "no file panic; shipped are easy, extreme, hard, mapping, medium"),
         ({"tour": "Z"}, "building default has no tour 'Z'; it has A, B, C, mapping"),
-        ({"lidar": "sonar"}, "there is no lidar 'sonar'; there are paper, hdl32e"),
+        ({"lidar": "sonar"}, "there is no lidar 'sonar'; there are paper, hdl32e, blindspot"),
+        ({"near": "sonar"}, "there is no lidar 'sonar'; there are paper, hdl32e, blindspot"),
     ],
 )
 def test_bad_settings_are_named(config: dict[str, object], sentence: str) -> None:

@@ -13,6 +13,7 @@ from graph.messages import PointCloud, Pose
 from operators.tracker import Tracker
 from operators.tracking.clusters import centres, clumps, nearest_of
 from operators.tracking.filter import corrected, met, predicted
+from operators.tracking.things import CELL, KEPT, SIDE, Things
 from operators.tracking.tracker import Habits
 from operators.tracking.tracker import Tracker as Tracking
 
@@ -185,7 +186,7 @@ def messages(steps=20):
 
 
 def test_operator_speaks_of_the_world_at_each_pose():
-    assert list(ports_of(Tracker).inputs) == ["people", "pose"]
+    assert list(ports_of(Tracker).inputs) == ["people", "near", "obstacles", "pose"]
     tracker = Tracker()
     for people, pose in messages():
         tracker.on_people(people)
@@ -216,3 +217,100 @@ def test_two_runs_say_the_same():
         return said
 
     assert run() == run()
+
+
+def seen_by(places, *, nearest, farthest, random, steps=3):
+    """A cloud (n, 3) in the frame of a lidar over the origin, of people at places, between two ranges."""
+    points = np.concatenate([body(place, (0.0, 0.0), random, 200) for place in places])
+    away = np.linalg.norm(points - MOUNT[:3, 3], axis=1)
+    return transform(inverse(MOUNT), points[(away > nearest) & (away < farthest)]).astype(np.float32)
+
+
+def watch(path, seconds, *, near, obstacles=None):
+    """Let a tracker operator follow somebody whom the lidar sees from 0.9 m on; `near`: with a second sensor."""
+    random, tracker, said = np.random.default_rng(2), Tracker(), None
+    for step in range(round(seconds / PERIOD)):
+        stamp = step * 100_000_000
+        stamped = {"measured_at": stamp, "base_from_lidar": MOUNT}
+        place = path(step * PERIOD)
+        tracker.on_people(PointCloud(points=seen_by([place], nearest=0.9, farthest=30.0, random=random), **stamped))
+        if near:
+            points = seen_by([place], nearest=0.1, farthest=2.0, random=random)
+            tracker.on_near(PointCloud(points=points, **stamped))
+        if obstacles is not None:
+            points = transform(inverse(MOUNT), obstacles).astype(np.float32)
+            tracker.on_obstacles(PointCloud(points=points, **stamped))
+        said = tracker.on_pose(Pose(measured_at=stamp, world_from_base=np.eye(4))).tracks
+    return said
+
+
+def turning(time):
+    """Walk up to the robot, and across its way where the lidar is blind."""
+    return 2.0 - 0.8 * min(time, 1.6), 0.3 - 0.8 * max(0.0, time - 1.6)
+
+
+def test_a_second_sensor_shows_who_walks_through_the_blind_ring():
+    near, far = watch(turning, 2.4, near=True), watch(turning, 2.4, near=False)
+    true = np.array(turning(2.3))
+    assert near.blind == 0.0
+    assert list(near.identity) == [1]
+    assert near.unseen[0] == 0.0
+    assert np.hypot(*(near.position[0] - true)) < 0.12
+    assert np.hypot(*(near.velocity[0] - (0.0, -0.8))) < 0.3
+    assert far.blind > 0.9
+    off = [np.hypot(*(place - true)) for place in far.position]
+    assert not off or min(off) > 0.2  # without it, nobody knows
+
+
+def test_things_beside_the_robot_are_nobody():
+    rng = np.random.default_rng(3)
+    table = np.stack([rng.uniform(-0.8, 0.8, 2000), rng.uniform(0.6, 1.4, 2000), np.full(2000, 0.7)], axis=1)
+    random, counts = np.random.default_rng(2), []
+    for known in (table, None):
+        tracker = Tracker()
+        for step in range(10):
+            stamped = {"measured_at": step * 100_000_000, "base_from_lidar": MOUNT}
+            tracker.on_people(PointCloud(points=np.zeros((0, 3), np.float32), **stamped))
+            seen = transform(inverse(MOUNT), table + random.normal(0.0, 0.01, table.shape)).astype(np.float32)
+            tracker.on_near(PointCloud(points=seen, **stamped))
+            if known is not None and step == 0:
+                tracker.on_obstacles(PointCloud(points=seen, **stamped))
+            said = tracker.on_pose(Pose(measured_at=stamped["measured_at"], world_from_base=np.eye(4))).tracks
+        counts.append(len(said.identity))
+    assert counts[0] == 0
+    assert counts[1] > 0
+
+
+def test_a_frame_of_the_second_sensor_that_never_comes_is_done_without():
+    random, tracker = np.random.default_rng(2), Tracker()
+    for step in range(6):
+        stamped = {"measured_at": step * 100_000_000, "base_from_lidar": MOUNT}
+        tracker.on_people(
+            PointCloud(points=seen_by([(2.0, 0.0)], nearest=0.9, farthest=30.0, random=random), **stamped)
+        )
+        if step < 3:
+            tracker.on_near(PointCloud(points=np.zeros((0, 3), np.float32), **stamped))
+        said = tracker.on_pose(Pose(measured_at=stamped["measured_at"], world_from_base=np.eye(4))).tracks
+        assert (said.blind == 0.0) == (step < 3)
+    assert list(said.identity) == [1]
+
+
+def test_near_without_obstacles_is_warned_of():
+    wired = frozenset({"people", "near", "pose"})
+    assert "near wants obstacles" in Tracker.missing(Tracker.Config(), wired)
+    assert Tracker.missing(Tracker.Config(), wired | {"obstacles"}) == ""
+    assert Tracker.missing(Tracker.Config(), frozenset({"people", "pose"})) == ""
+
+
+@given(st.lists(st.tuples(st.integers(-500, 500), st.integers(-500, 500)), min_size=1, max_size=30), st.integers(0, 9))
+@settings(max_examples=60, deadline=None)
+def test_things_are_remembered_where_they_were_and_nowhere_else(cells, seed):
+    """Against a plain twin: a dictionary of cells, of which one torus holds the latest that fall together."""
+    places = (np.array(cells) + 0.5) * CELL
+    things = Things()
+    things.observe(places, 1.0)
+    held = {(x % SIDE, y % SIDE): (x, y) for x, y in cells}
+    probe = np.array(cells) + np.random.default_rng(seed).integers(-2, 3, (len(cells), 2))
+    expected = [any((x + i, y + j) in held.values() for i in (-1, 0, 1) for j in (-1, 0, 1)) for x, y in probe.tolist()]
+    assert things.explain((probe + 0.5) * CELL, 2.0).tolist() == expected
+    assert not things.explain((probe + 0.5) * CELL, 2.1 + KEPT).any()

@@ -28,7 +28,7 @@ class Footprint(NamedTuple):
 
     def body(self) -> Body:
         """Return the footprint as the kernels take it."""
-        return Body(self.outline(), self.circumscribed)
+        return Body(self.outline(), self.circumscribed, (0.5 * self.length, 0.5 * self.width))
 
     def outline(self, spacing: float = 0.05) -> npt.NDArray[np.float64]:
         """Return points (n, 2) on the border in the base frame, at most `spacing` metres apart, corners included."""
@@ -53,6 +53,7 @@ class Body(NamedTuple):
 
     outline: npt.NDArray[np.float64]  # (n, 2) metres, base frame
     circumscribed: float  # metres
+    half: tuple[float, float]  # of length and width, metres
 
 
 @njit(cache=True)

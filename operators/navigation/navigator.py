@@ -14,7 +14,7 @@ from operators.navigation.costmap import CELL, COARSE, FREE, Costmap
 from operators.navigation.footprint import Footprint, Surroundings
 from operators.navigation.lattice import Lattice
 from operators.navigation.motion import Commands, Twist, towards
-from operators.navigation.people import NOBODY, Walkers
+from operators.navigation.people import NOBODY, Stubborn, Walkers, crowd
 from operators.navigation.search import UNIT, UNREACHED, Field, cost_to_go, trace
 from operators.navigation.window import STEP, DynamicWindow, Limits, way_around
 
@@ -103,6 +103,8 @@ class Navigator:
         self._tolerated = math.inf  # metres of room that do since no recovery could move the robot
         self._wedged_at = (0.0, 0.0)  # where that was
         self._walkers = NOBODY
+        self._stubborn = Stubborn()
+        self._stays = np.zeros(0, np.bool_)  # of the walkers
 
     def set_goal(self, x: float, y: float) -> None:
         """Drive to a place (metres, world) from now on."""
@@ -157,6 +159,7 @@ class Navigator:
         if self._given_up > 0:
             self._given_up -= 1
             return Twist(), "unreachable", None
+        self._stays = self._stubborn.among(self._walkers, pose[:2])
         if self._until_replan == 0:
             self._search(pose)
         self._until_replan -= 1
@@ -198,6 +201,8 @@ class Navigator:
         for seen in (True, False):
             weights = self.costmap.weights(pose[:2], seen=seen)
             sources, costs = self._sources(weights, lattice, per_metre)
+            if len(self._walkers):
+                crowd(weights, lattice.resolution, *lattice.origin, self._walkers, self._stays)
             field = cost_to_go(weights, sources, costs, start=start, margin=round(BEYOND * per_metre))
             found = field.cost[start] != UNREACHED
             if found:

@@ -12,68 +12,93 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+Flags = npt.NDArray[np.bool_]
 Walkers = npt.NDArray[np.float64]  # (k, 4): x, y in metres, velocity along x and y in m/s, now
 
 BODY = 0.22  # metres from the middle of a person to its side
-STRIDE = 0.22  # metres that feet swing ahead and behind besides, at a walk
+STRIDE = 0.30  # metres that feet swing ahead and behind besides, at a walk
 WALK = 0.6  # m/s at which they do so fully
-KEPT = 0.05  # metres kept free between a person and the robot's outline circle
-EASY = 0.50  # metres from which passing a person costs nothing
+KEPT = 0.07  # metres kept free between a person and the robot's outline
+AHEAD = 0.25  # seconds: and as far as the robot comes nearer in that time, for feet that are elsewhere than thought
+LAG = 0.2  # seconds by which a track is late to say that somebody has stopped
+EASY = 0.55  # metres from which passing a person costs nothing
 BELIEVED = 2.0  # seconds for which a velocity says where somebody will be
-CERTAIN = 1.0  # seconds within which nobody is driven into, by what is known now
+CERTAIN = 1.5  # seconds within which nobody is driven into, by what is known now
 PERSON_COST = 3.0  # seconds for each second's way at full speed with no room at all
 NEAR = 0.25  # metres: nearer, even a robot that stands is better elsewhere
-NEAR_COST = 3.0  # seconds a second with no room at all
+NEAR_COST = 1.5  # seconds a second with no room at all
 RETREAT = 0.3  # of that while the robot makes off
-GENTLE, SPEED_PER_METRE = 0.30, 2.0  # m/s with no room, and m/s more for each metre of it
+GENTLE, SPEED_PER_METRE = 0.30, 2.0  # m/s towards somebody with no room, and m/s more for each metre of it
+PASSING_SPEED_PER_METRE = 3.0  # the same for who passes somebody
 HURRY_COST = 4.0  # seconds a second, at twice the speed that the room allows
 COMING = 0.6  # seconds within which who comes towards a robot makes it give way
 COMES = 0.4  # m/s from which somebody walks
 COMING_ROOM = 0.1  # metres that shall be left then
 COMING_COST = 8.0  # seconds for each metre of it that is missing
+CROWDED = 8  # weight, besides the 8 of open floor, of a cell where somebody stands, falling with the distance squared
+BODILY = 600  # weight where somebody stands who does not step aside
+STUBBORN, STANDS = 0.66, 0.3  # metres from the robot's middle and m/s: who is nearer and slower does not step aside
+REMEMBERED = 200  # periods for which that is expected of them
+SAME = 0.4  # metres that somebody may seem to jump in a period
+PASSING = 0.45, 0.80  # metres to the middle of a person at which passing costs all, and nothing
+LINGERS = 0.5  # seconds: people are taken to be by then where the way leads past them
+HURRIES = 0.3  # share of the weight that is left of who walks at a metre a second
 
 NOBODY: Walkers = np.zeros((0, 4))
 
 
 @njit(cache=True)
-def person_room(walkers: Walkers, seconds: float, x: float, y: float) -> tuple[float, float, float]:
-    """Return the metres from a place to the nearest walker's side after some seconds, and the direction there.
+def person_room(
+    walkers: Walkers, half: tuple[float, float], seconds: float, x: float, y: float, yaw: float
+) -> tuple[float, float, float, float, float]:
+    """Return the metres between the robot's outline at a pose and the nearest walker's side after some seconds.
 
-    A walker may as well have stopped. Infinite without walkers; the direction is a unit vector.
+    half: of the robot's length and width, metres. A walker may as well have stopped. Infinite without walkers. Besides,
+    in the robot's frame: the unit vector to the walker, and the point of the outline that is nearest to it.
     """
-    least, along, across = math.inf, 1.0, 0.0
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    least, along, across, front, side = math.inf, 1.0, 0.0, half[0], 0.0
     for index in range(len(walkers)):
-        speed = math.sqrt(walkers[index, 2] ** 2 + walkers[index, 3] ** 2)
-        half = STRIDE * min(1.0, speed / WALK)
-        forward, left = (walkers[index, 2] / speed, walkers[index, 3] / speed) if speed > 1e-6 else (1.0, 0.0)
+        vx, vy = walkers[index, 2], walkers[index, 3]
+        speed = math.sqrt(vx * vx + vy * vy)
+        swing = STRIDE * min(1.0, speed / WALK)
+        forward, left = (vx / speed, vy / speed) if speed > 1e-6 else (1.0, 0.0)
         for share in range(2):
-            ahead = walkers[index, 0] + share * seconds * walkers[index, 2] - x
-            aside = walkers[index, 1] + share * seconds * walkers[index, 3] - y
-            foot = share * min(half, max(-half, -(ahead * forward + aside * left)))  # who stands has feet together
+            later = seconds if share == 1 else -LAG
+            ahead, aside = walkers[index, 0] + later * vx - x, walkers[index, 1] + later * vy - y
+            foot = share * min(swing, max(-swing, -(ahead * forward + aside * left)))  # who stands has feet together
             ahead, aside = ahead + foot * forward, aside + foot * left
-            away = math.sqrt(ahead * ahead + aside * aside)
+            ahead, aside = cosine * ahead + sine * aside, cosine * aside - sine * ahead
+            px, py = min(half[0], max(-half[0], ahead)), min(half[1], max(-half[1], aside))
+            away = math.sqrt((ahead - px) ** 2 + (aside - py) ** 2)
             if away - BODY < least:
                 least = away - BODY
                 if away > 1e-6:
-                    along, across = ahead / away, aside / away
-    return least, along, across
+                    along, across, front, side = (ahead - px) / away, (aside - py) / away, px, py
+    return least, along, across, front, side
 
 
 @njit(cache=True)
 def toll(
-    walkers: Walkers, radius: float, seconds: float, x: float, y: float, yaw: float, speed: float, top_speed: float
+    walkers: Walkers,
+    half: tuple[float, float],
+    seconds: float,
+    pose: tuple[float, float, float],
+    speed: float,
+    turn: float,
+    top_speed: float,
 ) -> tuple[float, bool]:
     """Return what a moment of driving costs near people, in seconds a second, and whether it drives into somebody.
 
-    radius: of the robot's outline circle, metres; seconds: from now; speed: m/s, forward.
+    half: of the robot's length and width, metres; seconds: from now; pose: x, y, yaw; speed: m/s, forward; turn: rad/s,
+    to the left.
     """
-    gap, along, across = person_room(walkers, min(seconds, BELIEVED), x, y)
-    gap -= radius
+    gap, along, across, front, side = person_room(walkers, half, min(seconds, BELIEVED), *pose)
     if gap >= EASY:
         return 0.0, False
     pace = abs(speed)
-    approach = speed * (math.cos(yaw) * along + math.sin(yaw) * across)
-    if gap < KEPT and seconds <= CERTAIN and approach > 0.02:
+    approach = (speed - turn * side) * along + turn * front * across
+    if gap < KEPT + AHEAD * max(approach, 0.0) and seconds <= CERTAIN and approach > 0.02:
         return 0.0, True
     sure = max(0.0, 1.0 - seconds / BELIEVED)
     room = max(gap, 0.0)
@@ -86,6 +111,7 @@ def toll(
     cost += PERSON_COST * closeness * closeness * pace / top_speed
     if approach > 0.0:
         cost += HURRY_COST * max(0.0, approach / (GENTLE + SPEED_PER_METRE * room) - 1.0)
+    cost += HURRY_COST * max(0.0, pace / (GENTLE + PASSING_SPEED_PER_METRE * room) - 1.0)
     return sure * cost, False
 
 
@@ -115,6 +141,63 @@ def surcharge(
             missing = max(missing, reach - math.sqrt(ahead * ahead + aside * aside))
     sure = COMING_COST * max(0.0, 1.0 - seconds / BELIEVED)
     return sure * missing, sure * missing_now
+
+
+@njit(cache=True)
+def crowd(
+    weights: npt.NDArray[np.int32],
+    resolution: float,
+    left: float,
+    bottom: float,
+    walkers: Walkers,
+    stays: Flags,
+) -> None:
+    """Add to the weights of a search what it costs to pass people; what is blocked stays so.
+
+    weights: on cells of `resolution` metres from the corner `left`, `bottom`. Most people step aside and cost little;
+    where somebody stays (k,), another way is sought.
+    """
+    reach = math.ceil(PASSING[1] / resolution)
+    for index in range(len(walkers)):
+        speed = math.sqrt(walkers[index, 2] ** 2 + walkers[index, 3] ** 2)
+        share = 1.0 - (1.0 - HURRIES) * min(1.0, speed)
+        x, y = walkers[index, 0] + LINGERS * walkers[index, 2], walkers[index, 1] + LINGERS * walkers[index, 3]
+        row, column = math.floor((y - bottom) / resolution), math.floor((x - left) / resolution)
+        for r in range(max(row - reach, 0), min(row + reach + 1, weights.shape[0])):
+            for c in range(max(column - reach, 0), min(column + reach + 1, weights.shape[1])):
+                away = math.hypot(left + (c + 0.5) * resolution - x, bottom + (r + 0.5) * resolution - y)
+                if weights[r, c] <= 0 or away >= PASSING[1]:
+                    continue
+                closeness = min(1.0, (PASSING[1] - away) / (PASSING[1] - PASSING[0]))
+                weights[r, c] += int(CROWDED * share * closeness * closeness)
+                if stays[index] and away < PASSING[0]:
+                    weights[r, c] += int(BODILY * share)
+
+
+class Stubborn:
+    """Who did not step aside when the robot came near, remembered so that it does not try the same again at once."""
+
+    def __init__(self) -> None:
+        self._place = np.zeros((0, 2))
+        self._left = np.zeros(0, np.int64)  # periods
+
+    def among(self, walkers: Walkers, robot: tuple[float, float]) -> Flags:
+        """Say which of the walkers (k, 4) are known to stay, a period after the last call; robot: x, y in metres."""
+        left = np.zeros(len(walkers), np.int64)
+        lost = []
+        for index in np.flatnonzero(self._left > 1):
+            away = np.hypot(*(walkers[:, :2] - self._place[index]).T)
+            nearest = int(np.argmin(away)) if len(walkers) else -1
+            if nearest >= 0 and away[nearest] < SAME:
+                left[nearest] = max(left[nearest], self._left[index] - 1)
+            else:
+                lost.append(index)
+        near = np.hypot(walkers[:, 0] - robot[0], walkers[:, 1] - robot[1]) < STUBBORN
+        left[near & (np.hypot(walkers[:, 2], walkers[:, 3]) < STANDS)] = REMEMBERED
+        stays = left > 0
+        self._place = np.concatenate([walkers[stays, :2], self._place[lost]])
+        self._left = np.concatenate([left[stays], self._left[lost] - 1])
+        return stays
 
 
 def nearby(walkers: Walkers, x: float, y: float, reach: float) -> Walkers:

@@ -152,7 +152,7 @@ def _roll(
         if rooms[k] < padding:
             return k - 1
         if len(walkers):
-            tolls[k], into = toll(walkers, body.circumscribed, k * STEP, x, y, yaw, speed, limits.speed)
+            tolls[k], into = toll(walkers, body.half, k * STEP, (x, y, yaw), speed, turn, limits.speed)
             if into and abs(speed) > abs(speeds[k - 1]) - 0.9 * limits.acceleration * STEP:  # and does not brake
                 return k - 1
             soon, met = surcharge(walkers, body.circumscribed, k * STEP, x, y, yaw, speed)
@@ -333,6 +333,6 @@ class DynamicWindow:
             x, y, yaw = advance(x, y, yaw, twist.linear, twist.angular, STEP)
             if room(around, self._body, COMFORT, x, y, yaw) < needed:
                 return step
-            if toll(walkers, self._body.circumscribed, step * STEP, x, y, yaw, twist.linear, self.limits.speed)[1]:
+            if toll(walkers, self._body.half, step * STEP, (x, y, yaw), *twist, self.limits.speed)[1]:
                 return step
         return steps

@@ -16,6 +16,7 @@ ROBOT = Path(__file__).parent / "robot.yaml"
 Graph = dict[str, Any]  # a graph file's content
 
 PLAYBACK = "graph.playback:operators.simulator.Simulator"
+NEAR = "blindspot"  # the second lidar of a robot that predicts people
 SEGMENTERS = {"network": "operators.segmenter:Segmenter", "truth": "operators.segmenter:TrueSegmenter"}
 
 
@@ -53,6 +54,8 @@ def session_graph(
     if map_file is not None:
         operators["localizer"]["config"] = {"map": map_file}
     operators["planner"]["config"]["people"] = session.people
+    if session.people == "predict":
+        operators["simulator"]["config"]["near"] = NEAR
     with_labels(graph, session.labels, weights=weights, threads=threads, voxel=voxel)
     if session.people == "ignore":
         without_tracker(graph)

@@ -1,0 +1,42 @@
+"""What stands near the robot and is nobody: cells of the floor that the lidar saw filled before it was too near."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+CELL = 0.1  # metres
+SIDE = 64  # cells of the torus: more than twice as far as anybody is looked for
+KEPT = 20.0  # seconds for which a cell is filled that nobody looks at again
+AROUND = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1)]
+
+
+class Things:
+    """The cells around the robot where something stands, on a torus: what it comes to replaces what it left."""
+
+    def __init__(self) -> None:
+        self._cell = np.full((SIDE, SIDE, 2), np.iinfo(np.int64).min, np.int64)  # whose place it is just now
+        self._seen = np.full((SIDE, SIDE), -np.inf)  # seconds, when something was last seen there
+
+    def observe(self, places: Floats, seconds: float) -> None:
+        """Remember that something stands at places (n, 2; world, metres) at a time."""
+        cell = np.floor(places / CELL).astype(np.int64)
+        row, column = (cell % SIDE).T
+        self._cell[row, column] = cell
+        self._seen[row, column] = seconds
+
+    def explain(self, places: Floats, seconds: float) -> Flags:
+        """Say which places (n, 2), seen at a time, lie in a filled cell or beside one; the cells are seen again."""
+        cell = np.floor(places / CELL).astype(np.int64)
+        known = np.zeros(len(places), np.bool_)
+        for step in AROUND:
+            there = cell + step
+            row, column = (there % SIDE).T
+            here = (self._cell[row, column] == there).all(axis=1) & (seconds - self._seen[row, column] <= KEPT)
+            if step == (0, 0):
+                self._seen[row[here], column[here]] = seconds
+            known |= here
+        return known
