@@ -41,7 +41,7 @@ def race(scenario: str) -> Race:
     same, gaps = 0, []
     world.step(0.0, 0.0)  # compiles
     for index in range(SCANS):
-        pose, share = world.sensor()
+        pose, share = world.sensor(world.lidar)
         pose[:2, 3] = world.layout.way[index * len(world.layout.way) // SCANS] + OFF_GRID
         begun = time.process_time()
         world.walk(0.1)

@@ -29,6 +29,8 @@ WAITING = 10  # frames kept until their pose is known
 LOWEST, HIGHEST = 0.1, 2.1  # metres above the floor between which people are
 NEAR = 1.2  # metres from the lidar: nearer, it shows but a part of somebody, and a second sensor all
 THINGS = 3.0  # metres from the lidar within which obstacles are remembered
+CLEAR, SOON, LATE = 1.4, 4, 1  # metres from which all of a person is seen and told from a thing, and what a sighting
+# weighs there, and nearer
 
 
 Frames = deque[PointCloud]
@@ -124,8 +126,9 @@ class Tracker(Operator):
         seconds = pose.measured_at / SECOND
         if obstacles is not None:
             places = transform(pose.world_from_base @ obstacles.base_from_lidar, obstacles.points.astype(np.float64))
-            close = _away(places, pose.world_from_base[:2, 3]) < THINGS
-            self.things.observe(places[close, :2], seconds)
+            away = _away(places, pose.world_from_base[:2, 3])
+            self.things.observe(places[away < CLEAR, :2], seconds, LATE)
+            self.things.observe(places[(away >= CLEAR) & (away < THINGS), :2], seconds, SOON)
         points = _standing(near, pose)
         points = points[_away(points, (pose.world_from_base @ near.base_from_lidar)[:2, 3]) < NEAR]
         return np.asarray(points[~self.things.explain(points[:, :2], seconds)])

@@ -107,7 +107,9 @@ def test_only_those_whom_the_robot_approaches_are_driven_into():
     assert driving(ahead(0.0), 0.5)[1]
     assert not driving(ahead(0.0), -0.2)[1]
     assert not driving(ahead(0.0), 0.0)[1]
-    assert not driving([[0.0, HALF[1] + BODY, 0.0, 0.0]], 0.5)[1]  # past somebody beside it
+    assert not driving([[0.0, HALF[1] + BODY + 0.2, 0.0, 0.0]], 0.5)[1]  # past somebody beside it
+    assert driving([[0.0, HALF[1] + BODY + 0.1, 0.0, 0.0]], 0.5)[1]  # too close for that speed
+    assert not driving([[0.0, HALF[1] + BODY + 0.1, 0.0, 0.0]], 0.1)[1]
     assert not driving(ahead(0.0), 0.5, turned=math.pi)[1]
 
 
@@ -125,9 +127,9 @@ def test_the_faster_the_robot_comes_the_more_room_it_leaves(speed, room):
 
 
 def test_toll_falls_with_distance_and_with_time():
-    costs = [driving(ahead(room), 0.8, seconds=0.3)[0] for room in (0.3, 0.36, 0.42, 0.48)]
+    costs = [driving(ahead(room), 0.5, seconds=0.3)[0] for room in (0.3, 0.36, 0.42, 0.48)]
     assert all(near > far > 0.0 for near, far in itertools.pairwise(costs))
-    assert driving(ahead(0.3), 0.8, seconds=1.5)[0] < driving(ahead(0.3), 0.8, seconds=0.3)[0]
+    assert driving(ahead(0.3), 0.5, seconds=1.5)[0] < driving(ahead(0.3), 0.5, seconds=0.3)[0]
 
 
 def weights_among(people, *, stays=False):

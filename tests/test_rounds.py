@@ -78,7 +78,9 @@ def test_graph_of_every_session_is_without_mistakes(tmp_path, labels, people):
     operators = yaml.safe_load(path.read_text())["operators"]
     assert ("segmenter" in operators) == (labels != "none")
     assert ("tracker" in operators) == (people == "predict" and labels != "none")
-    assert operators["simulator"]["config"] == {"building": BUILDING, "scenario": "hard", "tour": "A", "seed": 7}
+    near = {"near": "blindspot"} if people == "predict" else {}
+    wanted = {"building": BUILDING, "scenario": "hard", "tour": "A", "seed": 7} | near
+    assert operators["simulator"]["config"] == wanted
     assert operators["planner"]["config"] == {"people": people}
 
 

@@ -73,7 +73,7 @@ def test_ranges_are_multiples_of_the_step_and_within_the_limits() -> None:
 def test_turning_the_sensor_turns_the_cloud(crowded: World) -> None:
     world = crowded
     lidar, columns, beams = world.lidar, world.spec.columns, world.spec.beams
-    pose, share = world.sensor()
+    pose, share = world.sensor(world.lidar)
     straight = lidar.shoot(pose, share, world.people())
     turned = lidar.shoot(pose @ planar(0, 0, 2 * np.pi * 100 / columns), share, world.people())
     here = straight.distance.reshape(beams, columns)
@@ -217,6 +217,6 @@ def test_presets_are_the_sensors_of_the_paper() -> None:
 
 def test_rays_into_the_sky_meet_nothing() -> None:
     world = World(box_room(), NOBODY, "A", 0, lidar=msgspec.structs.replace(EXACT, lowest=80.0, highest=89.0))
-    pose, share = world.sensor()
+    pose, share = world.sensor(world.lidar)
     assert (world.lidar.shoot(pose, share, None).body == NOTHING).all()
     assert len(world.scan().points) == 0

@@ -268,12 +268,12 @@ def test_things_beside_the_robot_are_nobody():
     random, counts = np.random.default_rng(2), []
     for known in (table, None):
         tracker = Tracker()
-        for step in range(10):
+        for step in range(30):
             stamped = {"measured_at": step * 100_000_000, "base_from_lidar": MOUNT}
             tracker.on_people(PointCloud(points=np.zeros((0, 3), np.float32), **stamped))
             seen = transform(inverse(MOUNT), table + random.normal(0.0, 0.01, table.shape)).astype(np.float32)
             tracker.on_near(PointCloud(points=seen, **stamped))
-            if known is not None and step == 0:
+            if known is not None:
                 tracker.on_obstacles(PointCloud(points=seen, **stamped))
             said = tracker.on_pose(Pose(measured_at=stamped["measured_at"], world_from_base=np.eye(4))).tracks
         counts.append(len(said.identity))
@@ -293,6 +293,14 @@ def test_a_frame_of_the_second_sensor_that_never_comes_is_done_without():
         said = tracker.on_pose(Pose(measured_at=stamped["measured_at"], world_from_base=np.eye(4))).tracks
         assert (said.blind == 0.0) == (step < 3)
     assert list(said.identity) == [1]
+
+
+def test_who_passes_is_no_thing_even_if_taken_for_one_now_and_then():
+    things = Things()
+    for step in range(40):
+        things.observe(np.array([[0.05 * step, 0.0], [5.0 * CELL, 1.0]]), 0.1 * step, 1)
+    assert not things.explain(np.array([[1.0, 0.0], [1.9, 0.0]]), 4.0).any()
+    assert things.explain(np.array([[5.0 * CELL, 1.0]]), 4.0).all()
 
 
 def test_near_without_obstacles_is_warned_of():

@@ -19,7 +19,9 @@ BODY = 0.22  # metres from the middle of a person to its side
 STRIDE = 0.30  # metres that feet swing ahead and behind besides, at a walk
 WALK = 0.6  # m/s at which they do so fully
 KEPT = 0.07  # metres kept free between a person and the robot's outline
-AHEAD = 0.25  # seconds: and as far as the robot comes nearer in that time, for feet that are elsewhere than thought
+AHEAD = 0.35  # seconds: and as far as the robot comes nearer in that time, for feet that are elsewhere than thought
+GRAZE = 0.5  # share of its speed that counts where it passes beside somebody
+AWAY = 0.3  # share of its speed from which it makes off
 LAG = 0.2  # seconds by which a track is late to say that somebody has stopped
 EASY = 0.55  # metres from which passing a person costs nothing
 BELIEVED = 2.0  # seconds for which a velocity says where somebody will be
@@ -98,7 +100,8 @@ def toll(
         return 0.0, False
     pace = abs(speed)
     approach = (speed - turn * side) * along + turn * front * across
-    if gap < KEPT + AHEAD * max(approach, 0.0) and seconds <= CERTAIN and approach > 0.02:
+    moves = max(pace, approach) > 0.02 and approach > -AWAY * pace
+    if moves and gap < KEPT + AHEAD * max(approach, GRAZE * pace) and seconds <= CERTAIN:
         return 0.0, True
     sure = max(0.0, 1.0 - seconds / BELIEVED)
     room = max(gap, 0.0)
