@@ -150,7 +150,7 @@ def drive_limits_hold(tour):
 
 
 def test_ports_come_in_the_order_of_the_graph():
-    assert list(ports_of(Planner).inputs) == ["goal", "map", "obstacles", "people", "tracks", "pose"]
+    assert list(ports_of(Planner).inputs) == ["goal", "map", "obstacles", "people", "near", "tracks", "pose"]
     assert list(ports_of(Planner).outputs) == ["drive", "plan"]
 
 
@@ -302,8 +302,8 @@ def test_frame_before_its_pose_waits_for_it():
     assert np.abs(x - 3.0).max() < 0.05
 
 
-def hidden_after(people_reach, *, told=True):
-    """Show a planner a person at a distance, its echoes kept only beyond the ring; return how many it suspects."""
+def hidden_after(people_reach, *, told=True, blind=1.15):
+    """Show a planner a person at a distance, its echoes kept only beyond the ring; return whom it keeps clear of."""
     planner = Planner(Planner.Config(people="predict"))
     origin = np.array([2.0, 2.0, LIDAR_HEIGHT])
     person = [2.0 + people_reach - 0.1, 1.85, 0.0, 2.0 + people_reach + 0.1, 2.15, 1.8]
@@ -330,13 +330,18 @@ def hidden_after(people_reach, *, told=True):
                 position=nobody,
                 velocity=nobody,
                 unseen=np.zeros(0, np.float32),
+                blind=blind,
             )
         )
         planner.on_pose(Pose(measured_at=stamp, world_from_base=base))
-    return len(planner._presence.hidden)
+    return len(planner.navigator._walkers)
 
 
 def test_who_gives_rays_back_is_seen_and_who_swallows_them_is_near():
     assert hidden_after(1.6) == 0
     assert hidden_after(0.6) == 1
     assert hidden_after(1.6, told=False) == 0  # whose rays come back nobody said
+
+
+def test_nobody_is_suspected_where_the_tracker_sees_all():
+    assert hidden_after(0.6, blind=0.0) == 0

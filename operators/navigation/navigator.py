@@ -26,6 +26,7 @@ NEARBY_COST = 3.0  # metres of open floor that each metre from the blocked targe
 PATIENCE = 120  # periods without any way after which a target is called unreachable
 STILL, STILL_TURN = 0.15, 0.6  # metres and radians: moving less than this
 STILL_FOR = 30  # periods, is being stuck
+ROOTED_FOR = 60  # periods in one place, is being stuck as well, however much the robot turns
 ATTEMPTS = 8  # recoveries within FRESH metres after which a target is called unreachable
 FRESH = 1.0  # metres
 LOOSE = 0.3  # metres from where the robot was wedged
@@ -95,7 +96,7 @@ class Navigator:
         self._started = False
         self._until_replan = 0
         self._without_way = 0
-        self._trail: deque[Planar] = deque(maxlen=STILL_FOR)
+        self._trail: deque[Planar] = deque(maxlen=ROOTED_FOR)
         self._recovery: Recovery | None = None
         self._attempts = 0
         self._attempt_place = (0.0, 0.0)
@@ -122,6 +123,10 @@ class Navigator:
     def observe(self, points: npt.NDArray[np.float32], world_from_base: Matrix, base_from_lidar: Matrix) -> None:
         """Enter a frame: points (n, 3) in the lidar frame, and where the base was when it was taken."""
         self.costmap.observe(points, world_from_base @ base_from_lidar, float(world_from_base[2, 3]))
+
+    def glimpse(self, points: npt.NDArray[np.float32], world_from_base: Matrix, base_from_lidar: Matrix) -> None:
+        """Forget obstacles over which a second sensor looks: points (n, 3) in its frame, where `observe` has been."""
+        self.costmap.glimpse(points, world_from_base @ base_from_lidar, float(world_from_base[2, 3]))
 
     def meet(self, walkers: Walkers) -> None:
         """Keep clear of people (k, 4) from now on: x, y, metres and m/s, world, when a command takes effect."""
@@ -229,13 +234,14 @@ class Navigator:
         return flat, np.round(away[fit] * NEARBY_COST * per_metre).astype(np.int32)
 
     def _stuck(self, pose: Planar) -> bool:
-        """Say whether the robot has hardly moved for STILL_FOR periods."""
+        """Say whether the robot has hardly moved for STILL_FOR periods, or has but turned for ROOTED_FOR."""
         self._trail.append(pose)
         if len(self._trail) < STILL_FOR:
             return False
         trail = np.array(self._trail)
-        away = np.hypot(trail[:, 0] - pose[0], trail[:, 1] - pose[1]).max()
-        return bool(away < STILL and np.abs(wrap(trail[:, 2] - pose[2])).max() < STILL_TURN)
+        still = np.hypot(trail[:, 0] - pose[0], trail[:, 1] - pose[1]) < STILL
+        turned = np.abs(wrap(trail[-STILL_FOR:, 2] - pose[2])).max()
+        return bool(still[-STILL_FOR:].all() and (turned < STILL_TURN or (len(trail) == ROOTED_FOR and still.all())))
 
     def _recover(self, pose: Planar) -> None:
         """Start getting loose, or give up for a while after too many attempts in one place.
