@@ -143,3 +143,45 @@ def test_growing_keeps_what_is_known():
     before = filled(obstacles)
     obstacles.grow(lattice_around(0.05, (-20.0, -14.0), (12.0, 30.0)))
     assert np.allclose(np.sort(before, axis=0), np.sort(filled(obstacles), axis=0))
+
+
+SPARSE = np.meshgrid(np.radians(np.linspace(-50, 30, 16)), np.linspace(-np.pi, np.pi, 180, endpoint=False))
+
+
+def sparse(reach):
+    """What a sparse second lidar sees, up to 2 m, of a post or wall at a horizontal distance `reach(azimuth)`."""
+    elevation, azimuth = SPARSE
+    floor = np.where(elevation < 0, HEIGHT / np.tan(np.maximum(-elevation, 1e-6)), np.inf)
+    flat = np.minimum(np.broadcast_to(reach(azimuth), azimuth.shape), floor)
+    points = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), flat * np.tan(elevation)], axis=-1)
+    points = points.reshape(-1, 3)
+    return points[np.linalg.norm(points, axis=1) < 2.0].astype(np.float32)
+
+
+def test_a_second_lidar_empties_what_it_looks_over_and_leaves_the_rest():
+    """Two posts were seen from afar, then the robot came near; one of them, somebody's legs, has gone since."""
+    obstacles, here = layer(), planar(0.0, 0.0, 0.0, HEIGHT)
+    obstacles.fill(*np.transpose([obstacles.lattice.cell(0.0, y) for y in (0.7, -0.7)]))
+    assert len(filled(obstacles)) == 2
+    left = sparse(lambda a: np.where(np.abs(a - np.pi / 2) < 0.15, 0.68, 5.0))
+    for _ in range(3 * LIFE):
+        obstacles.glimpse(left, here, 0.0, 1.15)
+    assert np.allclose(filled(obstacles), [[0.025, 0.675]])
+    for _ in range(LIFE):
+        obstacles.glimpse(np.zeros((0, 3), np.float32), here, 0.0, 1.15)
+    assert len(filled(obstacles)) == 1  # who sees nothing proves nothing
+    for _ in range(LIFE):
+        obstacles.glimpse(sparse(lambda a: np.full_like(a, 5.0)), here, 0.0, 0.3)
+    assert len(filled(obstacles)) == 1  # beyond its radius
+    for count in range(LIFE):
+        assert len(filled(obstacles)) == 1, count
+        obstacles.glimpse(sparse(lambda a: np.full_like(a, 5.0)), here, 0.0, 1.15)
+    assert len(filled(obstacles)) == 0
+
+
+def test_a_second_lidar_does_not_look_through_things():
+    obstacles, here = layer(), planar(0.0, 0.0, 0.0, HEIGHT)
+    obstacles.fill(*np.transpose([obstacles.lattice.cell(1.0, 0.0)]))
+    for _ in range(3 * LIFE):
+        obstacles.glimpse(sparse(lambda a: np.where(np.abs(a) < 0.3, 0.6, 5.0)), here, 0.0, 1.15)
+    assert len(filled(obstacles)) == 1

@@ -12,6 +12,7 @@ from graph.contract import ports_of
 from graph.geometry import inverse, planar, transform
 from graph.messages import Goal, OccupancyGrid, PointCloud, Pose, Tracks
 from operators.navigation.footprint import Footprint
+from operators.navigation.navigator import Navigator
 from operators.planner import Planner
 
 PERIOD = 100_000_000  # nanoseconds
@@ -207,6 +208,18 @@ def test_robot_pushed_against_a_wall_gets_loose(room):
     tour.run(25)
     assert "recover" in tour.statuses
     assert tour.reached == 1
+
+
+@pytest.mark.parametrize(("turn", "seconds"), [(0.0, 3.0), (0.3, 6.0)])
+def test_robot_that_stays_in_one_place_is_stuck_even_if_it_turns(turn, seconds):
+    navigator = Navigator()
+    periods = 0
+    while not navigator._stuck((0.01 * (periods % 3), 0.0, turn * 0.1 * periods)):
+        periods += 1
+        assert periods < 100
+    assert periods + 1 == round(10 * seconds)
+    creeping = Navigator()
+    assert not any(creeping._stuck((0.03 * step, 0.0, 0.0)) for step in range(100))
 
 
 def test_person_in_the_door_is_waited_for():
