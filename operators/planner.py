@@ -3,7 +3,7 @@
 planner:
   run: operators.planner:Planner
   inputs: {goal: simulator/goal, map: localizer/occupancy, obstacles: triage/planning, people: triage/people,
-    near: simulator/near, tracks: tracker/tracks, pose: localizer/pose}
+    tracks: tracker/tracks, pose: localizer/pose}
   config: {people: predict}
 
 Where people are predicted and frames are classified, it wants `tracks` and `people`: whose echoes return is not near.
@@ -75,7 +75,6 @@ class Planner(Operator):
         self._poses: deque[tuple[int, Matrix]] = deque(maxlen=HISTORY)
         self._frames: deque[PointCloud] = deque(maxlen=WAITING)
         self._people: deque[PointCloud] = deque(maxlen=WAITING)
-        self._near: deque[PointCloud] = deque(maxlen=WAITING)
         self._tracks: Tracks | None = None
         self._presence = Presence()
 
@@ -88,9 +87,7 @@ class Planner(Operator):
         rehearsed.on_goal(Goal(measured_at=0, target=np.array([2.0, 1.0]), index=0, count=1))
         rehearsed.on_map(OccupancyGrid(measured_at=0, cells=cells, origin=np.array([-4.0, -4.0]), resolution=0.05))
         for stamp in (0, 100_000_000):
-            cloud = PointCloud(measured_at=stamp, points=room_scan(), base_from_lidar=mount)
-            rehearsed.on_obstacles(cloud)
-            rehearsed.on_near(cloud)
+            rehearsed.on_obstacles(PointCloud(measured_at=stamp, points=room_scan(), base_from_lidar=mount))
             walker = np.array([[1.0, 0.5]])
             rehearsed.on_tracks(
                 Tracks(
@@ -124,10 +121,6 @@ class Planner(Operator):
         assert people is not None
         self._people.append(people)
 
-    def on_near(self, near: PointCloud | None) -> None:
-        assert near is not None
-        self._near.append(near)
-
     def on_tracks(self, tracks: Tracks | None) -> None:
         self._tracks = tracks
 
@@ -138,9 +131,6 @@ class Planner(Operator):
             where = self._pose_at(frame.measured_at)
             if where is not None:
                 self.navigator.observe(frame.points, where, frame.base_from_lidar)
-                for near in self._near:
-                    if near.measured_at == frame.measured_at:
-                        self.navigator.glimpse(near.points, where, near.base_from_lidar)
                 if self.config.people == "predict" and (self._tracks is None or self._tracks.blind > 0.0):
                     things = self.navigator.costmap.standing(float(where[0, 3]), float(where[1, 3]), BLIND)
                     people = [other.points for other in self._people if other.measured_at == frame.measured_at]

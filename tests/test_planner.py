@@ -151,7 +151,7 @@ def drive_limits_hold(tour):
 
 
 def test_ports_come_in_the_order_of_the_graph():
-    assert list(ports_of(Planner).inputs) == ["goal", "map", "obstacles", "people", "near", "tracks", "pose"]
+    assert list(ports_of(Planner).inputs) == ["goal", "map", "obstacles", "people", "tracks", "pose"]
     assert list(ports_of(Planner).outputs) == ["drive", "plan"]
 
 

@@ -21,7 +21,6 @@ OCCUPIED = 50  # value of a map's cell from which it counts as occupied
 LARGEST = 250.0  # metres from border to border: 25 million cells, 800 MB
 MARGIN = 4.0  # metres of unknown floor kept around all that matters, so that a way can lead around
 
-BLIND = 1.15  # metres from the lidar within which it does not see all
 FREE = 8  # weight of open floor: whole numbers with room for an eighth
 TIGHT = 48  # added to it at the robot's inscribed radius, falling to nothing with the square of the distance
 UNKNOWN = 8  # added where neither map nor lidar have been
@@ -144,10 +143,6 @@ class Costmap:
         """Enter a frame: points (n, 3) in the lidar frame; floor: its height in the world, metres."""
         self.cover((float(world_from_lidar[0, 3]), float(world_from_lidar[1, 3])))
         self._stale = self._stale.joined(self.obstacles.observe(points, world_from_lidar, floor))
-
-    def glimpse(self, points: npt.NDArray[np.float32], world_from_lidar: npt.NDArray[np.float64], floor: float) -> None:
-        """Empty what a second sensor looks over where the lidar is blind: points (n, 3) in its frame; floor: metres."""
-        self._stale = self._stale.joined(self.obstacles.glimpse(points, world_from_lidar, floor, BLIND))
 
     def clear_footprint(self, footprint: Footprint, pose: tuple[float, float, float]) -> None:
         """Empty what seems to stand where the robot (x, y, yaw) itself stands."""

@@ -124,10 +124,6 @@ class Navigator:
         """Enter a frame: points (n, 3) in the lidar frame, and where the base was when it was taken."""
         self.costmap.observe(points, world_from_base @ base_from_lidar, float(world_from_base[2, 3]))
 
-    def glimpse(self, points: npt.NDArray[np.float32], world_from_base: Matrix, base_from_lidar: Matrix) -> None:
-        """Forget obstacles over which a second sensor looks: points (n, 3) in its frame, where `observe` has been."""
-        self.costmap.glimpse(points, world_from_base @ base_from_lidar, float(world_from_base[2, 3]))
-
     def meet(self, walkers: Walkers) -> None:
         """Keep clear of people (k, 4) from now on: x, y, metres and m/s, world, when a command takes effect."""
         self._walkers = walkers

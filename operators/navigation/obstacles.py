@@ -27,7 +27,6 @@ OVERHEAD = 0.15  # metres above the lidar: more than a table is
 SLOPE = 0.005  # metres a metre: how much the floor may seem to rise with distance, by a tilt of the pose
 
 SECTORS = 1080  # a third of a degree, one cell at 8.6 m
-COARSE_SECTORS = 120  # of a sparse sensor
 LOOK = 5.0  # metres: how far free floor is entered
 
 AZIMUTHS = 480
@@ -197,65 +196,6 @@ def look(
                 seen[row, column] = True
 
 
-@njit(cache=True)
-def glimpse(
-    life: npt.NDArray[np.uint8],
-    filled: npt.NDArray[np.bool_],
-    seen: npt.NDArray[np.bool_],
-    points: npt.NDArray[np.float32],
-    world_from_lidar: npt.NDArray[np.float64],
-    floor: float,
-    corner: tuple[float, float],
-    resolution: float,
-    box: Box,
-) -> None:
-    """Take life from the columns within a box of cells over which a sparse sensor looks, and renew those that it hits.
-
-    It looks as far as its nearest hit in a direction, or else its farthest floor: unlike `wear` it needs no full image.
-    """
-    pose = world_from_lidar
-    nearest, farthest = np.full(COARSE_SECTORS, np.inf), np.zeros(COARSE_SECTORS)
-    hit = np.zeros((box.bottom - box.top, box.right - box.left), np.bool_)
-    for index in range(len(points)):
-        x, y, z = np.float64(points[index, 0]), np.float64(points[index, 1]), np.float64(points[index, 2])
-        world_x, world_y, world_z = _moved(pose, x, y, z)
-        across, along = world_x - pose[0, 3], world_y - pose[1, 3]
-        away = math.sqrt(across * across + along * along)
-        sector = math.floor(math.atan2(along, across) * (COARSE_SECTORS / (2.0 * math.pi))) % COARSE_SECTORS
-        farthest[sector] = max(farthest[sector], away)
-        if not LOWEST + SLOPE * away <= world_z - floor < HIGHEST:
-            continue
-        nearest[sector] = min(nearest[sector], away)
-        row = math.floor((world_y - corner[1]) / resolution) - box.top
-        column = math.floor((world_x - corner[0]) / resolution) - box.left
-        for r in range(max(row - 1, 0), min(row + 2, hit.shape[0])):
-            for c in range(max(column - 1, 0), min(column + 2, hit.shape[1])):
-                hit[r, c] = True
-    for row in range(box.top, box.bottom):
-        for column in range(box.left, box.right):
-            if not filled[row, column]:
-                continue
-            across = corner[0] + (column + 0.5) * resolution - pose[0, 3]
-            along = corner[1] + (row + 0.5) * resolution - pose[1, 3]
-            away = math.sqrt(across * across + along * along)
-            sector = math.floor(math.atan2(along, across) * (COARSE_SECTORS / (2.0 * math.pi)))
-            passed = not hit[row - box.top, column - box.left]
-            for beside in range(-1, 2):
-                here = (sector + beside) % COARSE_SECTORS
-                end = nearest[here] if nearest[here] < np.inf else farthest[here]
-                passed = passed and end > away + 2.0 * resolution
-            remaining = False
-            for level in range(LEVELS):
-                if life[row, column, level] > 0:
-                    if passed:
-                        life[row, column, level] -= 1
-                    elif hit[row - box.top, column - box.left]:
-                        life[row, column, level] = LIFE
-                    remaining = remaining or life[row, column, level] > 0
-            if not remaining:
-                filled[row, column], seen[row, column] = False, True
-
-
 class ObstacleLayer:
     """The columns that hold something, on a raster that grows with the world. 24 bytes a cell."""
 
@@ -295,20 +235,6 @@ class ObstacleLayer:
         wear(*layers, panorama(points), inverse(pose), floor, *place, box, self.frame % SLOWLY == 0)
         strike(*layers, points, pose, floor, *place, self.reach)
         look(self.seen, points, pose, floor, *place, LOOK)
-        return box
-
-    def glimpse(
-        self, points: npt.NDArray[np.float32], world_from_lidar: npt.NDArray[np.float64], floor: float, radius: float
-    ) -> Box:
-        """Empty columns within `radius` metres that a second sensor looks over; fill none: nobody labels its points.
-
-        The rest, and what is returned, as `observe`.
-        """
-        pose, points = np.array(world_from_lidar, np.float64), np.array(points, np.float32)
-        row, column = self.lattice.cell(pose[0, 3], pose[1, 3])
-        box = Box(row, row + 1, column, column + 1).grown(math.ceil(radius / self.lattice.resolution), self.lattice)
-        place = self.lattice.origin, self.lattice.resolution
-        glimpse(self._life, self.filled, self.seen, points, pose, floor, *place, box)
         return box
 
     def erase(self, rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64]) -> None:
