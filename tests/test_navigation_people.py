@@ -23,6 +23,7 @@ from operators.navigation.people import (
     COMING_COST,
     COMING_ROOM,
     EASY,
+    GRAZE,
     KEPT,
     LAG,
     NOBODY,
@@ -90,8 +91,8 @@ def test_room_is_that_to_the_nearest_who_goes_on_or_has_stopped(people, x, y, tu
     assert abs(side) <= HALF[1]
 
 
-def driving(people, speed, *, turn=0.0, seconds=0.5, turned=0.0):
-    return toll(np.array(people).reshape(-1, 4), HALF, seconds, (0.0, 0.0, turned), speed, turn, 1.3)
+def driving(people, speed, *, turn=0.0, seconds=0.5, turned=0.0, graze=GRAZE):
+    return toll(np.array(people).reshape(-1, 4), HALF, seconds, (0.0, 0.0, turned), speed, turn, 1.3, graze)
 
 
 def ahead(room):
@@ -109,6 +110,7 @@ def test_only_those_whom_the_robot_approaches_are_driven_into():
     assert not driving(ahead(0.0), 0.0)[1]
     assert not driving([[0.0, HALF[1] + BODY + 0.2, 0.0, 0.0]], 0.5)[1]  # past somebody beside it
     assert driving([[0.0, HALF[1] + BODY + 0.1, 0.0, 0.0]], 0.5)[1]  # too close for that speed
+    assert not driving([[0.0, HALF[1] + BODY + 0.1, 0.0, 0.0]], 0.5, graze=0.0)[1]
     assert not driving([[0.0, HALF[1] + BODY + 0.1, 0.0, 0.0]], 0.1)[1]
     assert not driving(ahead(0.0), 0.5, turned=math.pi)[1]
 

@@ -89,19 +89,20 @@ def toll(
     speed: float,
     turn: float,
     top_speed: float,
+    graze: float,
 ) -> tuple[float, bool]:
     """Return what a moment of driving costs near people, in seconds a second, and whether it drives into somebody.
 
     half: of the robot's length and width, metres; seconds: from now; pose: x, y, yaw; speed: m/s, forward; turn: rad/s,
-    to the left.
+    to the left; graze: GRAZE, or 0 for a robot that would never get away from who stands beside it.
     """
     gap, along, across, front, side = person_room(walkers, half, min(seconds, BELIEVED), *pose)
     if gap >= EASY:
         return 0.0, False
     pace = abs(speed)
     approach = (speed - turn * side) * along + turn * front * across
-    moves = max(pace, approach) > 0.02 and approach > -AWAY * pace
-    if moves and gap < KEPT + AHEAD * max(approach, GRAZE * pace) and seconds <= CERTAIN:
+    moves = approach > 0.02 or (graze > 0.0 and pace > 0.02 and approach > -AWAY * pace)
+    if moves and gap < KEPT + AHEAD * max(approach, graze * pace) and seconds <= CERTAIN:
         return 0.0, True
     sure = max(0.0, 1.0 - seconds / BELIEVED)
     room = max(gap, 0.0)
