@@ -189,7 +189,6 @@ class Navigator:
             top_speed=top_speed,
             walkers=self._walkers,
             tolerated=self._tolerated,
-            rooted=self._rooted(pose),
         )
         return choice.target, "follow", choice.trajectory
 
@@ -239,13 +238,6 @@ class Navigator:
         still = np.hypot(trail[:, 0] - pose[0], trail[:, 1] - pose[1]) < STILL
         turned = np.abs(wrap(trail[-STILL_FOR:, 2] - pose[2])).max()
         return bool(still[-STILL_FOR:].all() and (turned < STILL_TURN or (len(trail) == ROOTED_FOR and still.all())))
-
-    def _rooted(self, pose: Planar) -> bool:
-        """Say whether the robot has been in one place for STILL_FOR periods, turning or not."""
-        if len(self._trail) < STILL_FOR:
-            return False
-        trail = np.array(self._trail)[-STILL_FOR:]
-        return bool((np.hypot(trail[:, 0] - pose[0], trail[:, 1] - pose[1]) < STILL).all())
 
     def _recover(self, pose: Planar) -> None:
         """Start getting loose, or give up for a while after too many attempts in one place.

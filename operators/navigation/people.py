@@ -19,9 +19,7 @@ BODY = 0.22  # metres from the middle of a person to its side
 STRIDE = 0.30  # metres that feet swing ahead and behind besides, at a walk
 WALK = 0.6  # m/s at which they do so fully
 KEPT = 0.07  # metres kept free between a person and the robot's outline
-AHEAD = 0.35  # seconds: and as far as the robot comes nearer in that time, for feet that are elsewhere than thought
-GRAZE = 0.5  # share of its speed that counts where it passes beside somebody
-AWAY = 0.3  # share of its speed from which it makes off
+AHEAD = 0.25  # seconds: and as far as the robot comes nearer in that time, for feet that are elsewhere than thought
 LAG = 0.2  # seconds by which a track is late to say that somebody has stopped
 EASY = 0.55  # metres from which passing a person costs nothing
 BELIEVED = 2.0  # seconds for which a velocity says where somebody will be
@@ -89,20 +87,18 @@ def toll(
     speed: float,
     turn: float,
     top_speed: float,
-    graze: float,
 ) -> tuple[float, bool]:
     """Return what a moment of driving costs near people, in seconds a second, and whether it drives into somebody.
 
     half: of the robot's length and width, metres; seconds: from now; pose: x, y, yaw; speed: m/s, forward; turn: rad/s,
-    to the left; graze: GRAZE, or 0 for a robot that would never get away from who stands beside it.
+    to the left.
     """
     gap, along, across, front, side = person_room(walkers, half, min(seconds, BELIEVED), *pose)
     if gap >= EASY:
         return 0.0, False
     pace = abs(speed)
     approach = (speed - turn * side) * along + turn * front * across
-    moves = approach > 0.02 or (graze > 0.0 and pace > 0.02 and approach > -AWAY * pace)
-    if moves and gap < KEPT + AHEAD * max(approach, graze * pace) and seconds <= CERTAIN:
+    if gap < KEPT + AHEAD * max(approach, 0.0) and seconds <= CERTAIN and approach > 0.02:
         return 0.0, True
     sure = max(0.0, 1.0 - seconds / BELIEVED)
     room = max(gap, 0.0)

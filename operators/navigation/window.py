@@ -17,7 +17,7 @@ from numba import njit
 from operators.navigation.footprint import Body, Footprint, Surroundings, room
 from operators.navigation.lattice import Lattice
 from operators.navigation.motion import Twist, advance, towards
-from operators.navigation.people import GRAZE, NOBODY, Walkers, nearby, surcharge, toll
+from operators.navigation.people import NOBODY, Walkers, nearby, surcharge, toll
 from operators.navigation.search import UNREACHED, Field
 
 STEP = 0.1  # seconds between the poses of an arc: one period of the controller
@@ -137,7 +137,6 @@ def _roll(
     body: Body,
     padding: float,
     walkers: Walkers,
-    graze: float,
     tolls: npt.NDArray[np.float64],
     surcharges: npt.NDArray[np.float64],
 ) -> int:
@@ -153,7 +152,7 @@ def _roll(
         if rooms[k] < padding:
             return k - 1
         if len(walkers):
-            tolls[k], into = toll(walkers, body.half, k * STEP, (x, y, yaw), speed, turn, limits.speed, graze)
+            tolls[k], into = toll(walkers, body.half, k * STEP, (x, y, yaw), speed, turn, limits.speed)
             if into and abs(speed) > abs(speeds[k - 1]) - 0.9 * limits.acceleration * STEP:  # and does not brake
                 return k - 1
             soon, met = surcharge(walkers, body.circumscribed, k * STEP, x, y, yaw, speed)
@@ -227,7 +226,6 @@ def _choose(
     tolerated: float,
     way: Way,
     walkers: Walkers,
-    graze: float,
 ) -> tuple[float, float, float, npt.NDArray[np.float64]]:
     poses = np.empty((steps + 1, 3))
     speeds, turns, rooms = np.empty(steps + 1), np.empty(steps + 1), np.empty(steps + 1)
@@ -241,7 +239,7 @@ def _choose(
     for i in range(len(speeds_wanted)):
         for j in range(len(turns_wanted)):
             wanted = (speeds_wanted[i], turns_wanted[j])
-            free = _roll(poses, speeds, turns, rooms, wanted, limits, around, body, needed, walkers, graze, *paid)
+            free = _roll(poses, speeds, turns, rooms, wanted, limits, around, body, needed, walkers, *paid)
             total, at = _judge(poses, speeds, turns, rooms, *paid, free, limits, way)
             total += SWERVE_COST * abs(turns_wanted[j] - turn_before)
             if total < best:
@@ -281,13 +279,11 @@ class DynamicWindow:
         top_speed: float,
         walkers: Walkers = NOBODY,
         tolerated: float = math.inf,
-        rooted: bool = False,
     ) -> Choice:
         """Choose velocities to aim for, for the robot at a pose (x, y, yaw) that drives at `now`.
 
         top_speed in m/s. walkers: people (k, 4) to keep clear of, at the moment of the pose. tolerated: metres of
-        room that do for a robot that cannot move otherwise, as `tolerated` says. rooted: it has not got on
-        for a while, and may slip past people that stand beside it.
+        room that do for a robot that cannot move otherwise, as `tolerated` says.
         """
         speeds, turns = self._samples
         reverse = [-min(self.limits.reverse, top_speed)]
@@ -309,7 +305,6 @@ class DynamicWindow:
             tolerated,
             way,
             walkers,
-            0.0 if rooted else GRAZE,
         )
         self._turn_before = turn
         return Choice(Twist(speed, turn), trajectory, best)
@@ -338,6 +333,6 @@ class DynamicWindow:
             x, y, yaw = advance(x, y, yaw, twist.linear, twist.angular, STEP)
             if room(around, self._body, COMFORT, x, y, yaw) < needed:
                 return step
-            if toll(walkers, self._body.half, step * STEP, (x, y, yaw), *twist, self.limits.speed, 0.0)[1]:
+            if toll(walkers, self._body.half, step * STEP, (x, y, yaw), *twist, self.limits.speed)[1]:
                 return step
         return steps
