@@ -35,7 +35,7 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     dropout: float = 0.0  # share lost at grazing incidence and far away, at most
 
 
-# blindspot: a hemispherical sensor of the kind sold for the floor around a robot, sparse, and blind nowhere.
+# blindspot: a sparse sensor that looks steeply up and down, of the kind sold for what stands close around a robot.
 # hdl32e: angles, columns at 10 Hz, range and its step are the data sheet's. The noise is a real sensor's: in a capture,
 # nine firings of one beam in a row scatter by 4.5 mm (median, 3 to 10 m away) about a smooth curve.
 PRESETS = {

@@ -20,9 +20,7 @@ Flags = npt.NDArray[np.bool_]
 MARGIN = 0.5  # metres: people and obstacles push within it
 BODY = 0.22  # metres: half the breadth of a person
 ROBOT = 0.27  # metres: half the diagonal of the robot
-FOOT = (
-    0.31  # of a person's height, by which feet reach ahead of the hips: with ROBOT, nobody steps nearer to its middle
-)
+FOOT = 0.31  # of a person's height: how far feet reach ahead of the hips, and so keep off the robot besides ROBOT
 BREATH = 0.38  # metres between the middles of two people, at the least
 TURNING = 0.6  # rad/sqrt(s), of a wanderer's heading
 STAND_SHARE = 0.2  # of its time that a wanderer stands

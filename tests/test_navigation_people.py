@@ -166,7 +166,9 @@ def test_who_stands_near_is_remembered_and_followed_and_forgotten():
     moved = [there[0] + 0.9 * SAME, 0.0, 0.0, 0.0]
     for _ in range(REMEMBERED - 4):
         assert stubborn.among(np.array([far, moved]), (-5.0, 0.0)).tolist() == [False, True]
-    assert [stubborn.among(np.array([moved]), (-5.0, 0.0))[0] for _ in range(4)][-1] == False  # noqa: E712
+    for _ in range(4):
+        stays = stubborn.among(np.array([moved]), (-5.0, 0.0))
+    assert not stays.any()
     other = Stubborn()
     other.among(np.array([there]), (0.0, 0.0))
     assert not other.among(np.array([[there[0] + 2.0 * SAME, 0.0, 0.0, 0.0]]), (-5.0, 0.0)).any()  # somebody else

@@ -154,8 +154,8 @@ def crowd(
 ) -> None:
     """Add to the weights of a search what it costs to pass people; what is blocked stays so.
 
-    weights: on cells of `resolution` metres from the corner `left`, `bottom`. Most people step aside and cost little;
-    where somebody stays (k,), another way is sought.
+    weights: (rows, columns), on cells of `resolution` metres from the corner `left`, `bottom`, metres; stays: (k,) who
+    does not step aside: there another way is sought. Most people do, and cost little.
     """
     reach = math.ceil(PASSING[1] / resolution)
     for index in range(len(walkers)):
