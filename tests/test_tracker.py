@@ -310,15 +310,25 @@ def test_near_without_obstacles_is_warned_of():
     assert Tracker.missing(Tracker.Config(), frozenset({"people", "pose"})) == ""
 
 
-@given(st.lists(st.tuples(st.integers(-500, 500), st.integers(-500, 500)), min_size=1, max_size=30), st.integers(0, 9))
+window = st.tuples(st.integers(-500, 500), st.integers(-500, 500))
+cells = st.lists(st.tuples(st.integers(0, SIDE - 1), st.integers(0, SIDE - 1)), min_size=1, max_size=30)
+
+
+@given(st.lists(st.tuples(window, cells), min_size=1, max_size=4), st.integers(0, 9))
 @settings(max_examples=60, deadline=None)
-def test_things_are_remembered_where_they_were_and_nowhere_else(cells, seed):
-    """Against a plain twin: a dictionary of cells, of which one torus holds the latest that fall together."""
-    places = (np.array(cells) + 0.5) * CELL
-    things = Things()
-    things.observe(places, 1.0)
-    held = {(x % SIDE, y % SIDE): (x, y) for x, y in cells}
-    probe = np.array(cells) + np.random.default_rng(seed).integers(-2, 3, (len(cells), 2))
+def test_things_are_remembered_where_they_were_and_nowhere_else(frames, seed):
+    """Against a plain twin: a dictionary of cells, of which the torus holds those of the last frame that fall together.
+
+    A frame reaches no farther than once around the torus.
+    """
+    things, held, everywhere = Things(), {}, []
+    for corner, offsets in frames:
+        filled = np.array(offsets) + corner
+        things.observe((filled + 0.5) * CELL, 1.0)
+        held |= {(x % SIDE, y % SIDE): (x, y) for x, y in filled.tolist()}
+        everywhere.append(filled)
+    probe = np.concatenate(everywhere)
+    probe = probe + np.random.default_rng(seed).integers(-2, 3, probe.shape)
     expected = [any((x + i, y + j) in held.values() for i in (-1, 0, 1) for j in (-1, 0, 1)) for x, y in probe.tolist()]
     assert things.explain((probe + 0.5) * CELL, 2.0).tolist() == expected
     assert not things.explain((probe + 0.5) * CELL, 2.1 + KEPT).any()

@@ -10,7 +10,7 @@ Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 
 CELL = 0.1  # metres
-SIDE = 64  # cells of the torus: more than twice as far as anybody is looked for
+SIDE = 64  # cells of the torus: more than a frame reaches, so that no two of its places fall together
 KEPT = 20.0  # seconds for which a cell is filled that nobody looks at again
 SURE = 20  # by which weight of sightings something stands in a cell: who passes is not there for so long
 AROUND = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1)]
