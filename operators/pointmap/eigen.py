@@ -74,8 +74,9 @@ def smallest_direction(
         yz * xz - xy * c,
         xy * yz - b * xz,
     )
-    # A double smallest eigenvalue: any direction across the largest, which is the direction of every row.
-    double = uu <= 1e-28 * scale * scale * scale * scale
+    # A double smallest eigenvalue: any direction across the largest, which is the direction of every row. Shorter than
+    # this the cross products are right to less than 1e-6, what is left of products of 1e-16.
+    double = uu <= 1e-20 * scale * scale * scale * scale
     rx, ry, rz, _ = longest(a, xy, xz, xy, b, yz, xz, yz, c)
     flat = abs(rx) < abs(rz)
     tx, ty, tz = 0.0 if flat else ry, rz if flat else -rx, -ry if flat else 0.0
