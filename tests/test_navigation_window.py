@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from operators.navigation.distance import distance_to
 from operators.navigation.footprint import Footprint, Surroundings, inside, room
 from operators.navigation.lattice import Lattice
-from operators.navigation.motion import Commands, Twist, advance, towards
+from operators.navigation.motion import Commands, Progress, Twist, advance, towards
 from operators.navigation.search import cost_to_go
 from operators.navigation.window import DynamicWindow, Limits, way_around
 
@@ -105,6 +105,43 @@ def test_prediction_follows_the_commands_in_flight(latency):
         predicted = fresh.predict(step * period, *true[step * 100])
         assert np.abs(np.subtract(predicted, true[step * 100 + round(latency * 1000)])).max() < 2e-3
         fresh.give(step * period, given_at[step][1])
+
+
+PERIOD = 100_000_000  # nanoseconds
+
+
+def hindered_while(wanted, real, periods=8, *, noise=0.0, turn=1.0):
+    """Drive by one command and move by another velocity; return what is said at each pose."""
+    commands, progress, said = Commands(0.1), Progress(turn), []
+    random = np.random.default_rng(0)
+    pose = (1.0, 2.0, 3.0)
+    for step in range(periods):
+        measured = np.array(pose) + noise * random.standard_normal(3)
+        said.append(progress.hindered(commands, step * PERIOD, *measured))
+        commands.give(step * PERIOD, wanted)
+        pose = advance(*pose, *(real if step else Twist()), 0.1)
+    return said
+
+
+@given(st.floats(-0.2, 1.3), st.floats(-1, 1), st.floats(0.0, 0.01))
+def test_robot_that_gets_on_is_not_hindered(linear, angular, noise):
+    wanted = Twist(linear, angular)
+    assert not any(hindered_while(wanted, wanted, noise=noise))
+
+
+@given(st.floats(0.4, 1.3), st.sampled_from([-1, 1]), st.floats(-0.5, 0.04), st.floats(-2, 2))
+def test_robot_that_is_held_knows_its_speed(linear, sign, left, angular):
+    """What is left of the speed is said, never the other way round; turns as far as the drive can."""
+    said = hindered_while(Twist(sign * linear, 0.0), Twist(sign * left, angular))
+    assert said[0] is None
+    assert said[-1].linear == pytest.approx(sign * max(left, 0.0), abs=1e-3)
+    assert said[-1].angular == pytest.approx(min(max(angular, -1.0), 1.0), abs=1e-6)
+
+
+def test_robot_that_is_turned_knows_it():
+    said = hindered_while(Twist(1.0, 0.0), Twist(1.0, -1.5))[-1]
+    assert said.angular == -1.0
+    assert said.linear == pytest.approx(1.0, rel=0.02)  # the chord of an arc
 
 
 @pytest.mark.parametrize(("goal", "sign"), [((5.0, 0.05), 0), ((0.05, 5.0), 1), ((0.05, -5.0), -1)])

@@ -8,6 +8,11 @@ from typing import NamedTuple
 
 from numba import njit
 
+from graph.geometry import wrap
+
+WATCHED = 3  # periods over which poses are held against commands
+SLOWED, TURNED = 0.35, 0.8  # m/s less and rad/s beside what was commanded: a slip of the drive, or somebody in the way
+
 
 class Twist(NamedTuple):
     """A velocity of the base."""
@@ -65,3 +70,34 @@ class Commands:
             x, y, yaw = advance(x, y, yaw, command.linear, command.angular, (change - now) * 1e-9)
             now = change
         return x, y, yaw
+
+
+class Progress:
+    """What becomes of the commands: whether the robot gets on as they say, or pushes against something."""
+
+    def __init__(self, turn: float) -> None:
+        """Take the fastest turn of the drive in rad/s."""
+        self._turn = turn
+        self._poses: deque[tuple[int, float, float, float]] = deque(maxlen=WATCHED + 1)
+
+    def hindered(self, commands: Commands, measured_at: int, x: float, y: float, yaw: float) -> Twist | None:
+        """Return the velocity that the robot has had of late if the commands say another; None while all is well.
+
+        measured_at in nanoseconds; x, y in metres and yaw in radians, as measured then. To be asked at every pose.
+        """
+        self._poses.append((measured_at, x, y, yaw))
+        since, x_then, y_then, yaw_then = self._poses[0]
+        seconds = (measured_at - since) * 1e-9
+        if len(self._poses) <= WATCHED or seconds <= 0.0:
+            return None
+        turned = float(wrap(yaw - yaw_then))
+        middle = yaw_then + 0.5 * turned
+        linear = ((x - x_then) * math.cos(middle) + (y - y_then) * math.sin(middle)) / seconds
+        angular = turned / seconds
+        given = [commands.at(pose[0]) for pose in list(self._poses)[:-1]]
+        wanted = sum(command.linear for command in given) / WATCHED
+        slowed = math.copysign(1.0, wanted) * (wanted - linear) > SLOWED
+        if not slowed and abs(angular - sum(command.angular for command in given) / WATCHED) < TURNED:
+            return None
+        slower = min(max(math.copysign(1.0, wanted) * linear, 0.0), abs(wanted))
+        return Twist(math.copysign(slower, wanted), min(max(angular, -self._turn), self._turn))

@@ -13,7 +13,7 @@ from graph.geometry import Matrix, wrap, yaw
 from operators.navigation.costmap import CELL, COARSE, FREE, Costmap
 from operators.navigation.footprint import Footprint, Surroundings
 from operators.navigation.lattice import Lattice
-from operators.navigation.motion import Commands, Twist, towards
+from operators.navigation.motion import Commands, Progress, Twist, advance, towards
 from operators.navigation.people import NOBODY, Stubborn, Walkers, crowd
 from operators.navigation.search import UNIT, UNREACHED, Field, cost_to_go, trace
 from operators.navigation.window import STEP, DynamicWindow, Limits, way_around
@@ -87,6 +87,7 @@ class Navigator:
         self.limits = limits or Limits()
         self.costmap = Costmap(lethal=self.footprint.inscribed + padding + 0.5 * CELL, inflation=inflation)
         self.commands = Commands(latency)
+        self._progress = Progress(self.limits.turn)
         self.window = DynamicWindow(self.footprint, self.limits, horizon=horizon, padding=padding)
         self._side = side
         self._goal: tuple[float, float] | None = None
@@ -131,9 +132,13 @@ class Navigator:
     def step(self, measured_at: int, world_from_base: Matrix, *, valid: bool = True) -> Decision:
         """Decide what to do from a pose measured at a time in nanoseconds; drive carefully when it is not valid."""
         measured = float(world_from_base[0, 3]), float(world_from_base[1, 3]), yaw(world_from_base)
-        pose = self.commands.predict(measured_at, *measured)
-        wanted, status, trajectory = self._choose(measured, pose, self.limits.speed if valid else CAREFUL_SPEED)
-        now, limits = self.commands.latest, self.limits
+        hindered = self._progress.hindered(self.commands, measured_at, *measured)
+        if hindered is None:
+            now, pose = self.commands.latest, self.commands.predict(measured_at, *measured)
+        else:
+            now, pose = hindered, advance(*measured, *hindered, self.commands.latency)
+        limits = self.limits
+        wanted, status, trajectory = self._choose(measured, pose, now, limits.speed if valid else CAREFUL_SPEED)
         twist = Twist(
             towards(now.linear, wanted.linear, limits.acceleration * STEP),
             towards(now.angular, wanted.angular, limits.turn_acceleration * STEP),
@@ -143,9 +148,12 @@ class Navigator:
         return Decision(twist, path, np.array([pose]) if trajectory is None else trajectory, status)
 
     def _choose(
-        self, measured: Planar, pose: Planar, top_speed: float
+        self, measured: Planar, pose: Planar, now: Twist, top_speed: float
     ) -> tuple[Twist, str, npt.NDArray[np.float64] | None]:
-        """Return the velocities to come to, the status and the trajectory; `pose` is `measured`, carried on to now."""
+        """Return the velocities to come to, the status and the trajectory.
+
+        `pose` is `measured`, carried on to when the command takes effect; `now` the velocity that the robot has then.
+        """
         if self._goal is None:
             return Twist(), "wait", None
         self.costmap.cover(pose[:2], self._goal)
@@ -183,7 +191,7 @@ class Navigator:
         top_speed = min(top_speed, math.sqrt(2.0 * self.limits.acceleration * left))  # so as to stop at the goal
         choice = self.window.choose(
             pose,
-            self.commands.latest,
+            now,
             around,
             way,
             top_speed=top_speed,
