@@ -20,6 +20,8 @@ STRIDE = 0.30  # metres that feet swing ahead and behind besides, at a walk
 WALK = 0.6  # m/s at which they do so fully
 KEPT = 0.07  # metres kept free between a person and the robot's outline
 AHEAD = 0.25  # seconds: and as far as the robot comes nearer in that time, for feet that are elsewhere than thought
+SLOWLY, HASTY = 0.25, 0.2  # m/s up to which that does, and seconds: as far as it goes in them by what it is faster
+AWAY = 0.3  # share of its speed by which a robot has to leave people behind, to be held up by none
 LAG = 0.2  # seconds by which a track is late to say that somebody has stopped
 EASY = 0.55  # metres from which passing a person costs nothing
 BELIEVED = 2.0  # seconds for which a velocity says where somebody will be
@@ -98,7 +100,9 @@ def toll(
         return 0.0, False
     pace = abs(speed)
     approach = (speed - turn * side) * along + turn * front * across
-    if gap < KEPT + AHEAD * max(approach, 0.0) and seconds <= CERTAIN and approach > 0.02:
+    haste = max(0.0, pace - SLOWLY)
+    moves = approach > 0.02 or (haste > 0.0 and approach > -AWAY * pace)
+    if moves and seconds <= CERTAIN and gap < KEPT + AHEAD * max(approach, 0.0) + HASTY * haste:
         return 0.0, True
     sure = max(0.0, 1.0 - seconds / BELIEVED)
     room = max(gap, 0.0)
