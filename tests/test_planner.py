@@ -266,6 +266,24 @@ def test_uncertain_pose_slows_down():
     assert 0.2 < max(speed for speed, _ in tour.drives) <= 0.4 + 1e-9
 
 
+def test_robot_that_is_held_plans_from_the_speed_that_it_has():
+    """It does not push on at full speed, but gathers speed anew until it notices again that it does not get on."""
+    building = Building(ROOM, (1.5, 4.0, 0.0))
+    tour = Tour(building, [(7.0, 4.0)]).run(1.5)
+    before = tour.drives[-1][0]
+    held = building.pose.copy()
+    pushing = []
+    for _ in range(12):
+        building.pose = held.copy()
+        tour.step()
+        pushing.append(tour.drives[-1][0])
+    assert before > 1.0
+    assert min(pushing) < 0.2
+    assert max(pushing[2:]) < 0.8
+    tour.run(10)
+    assert tour.reached == 1
+
+
 def test_map_leads_around_what_the_lidar_cannot_see():
     """The door of the wall ahead is known from the map before the lidar has seen anything."""
     cells = np.zeros((160, 160), np.int8)

@@ -11,7 +11,7 @@ from numba import njit
 from graph.geometry import wrap
 
 WATCHED = 3  # periods over which poses are held against commands
-SLOWED, TURNED = 0.35, 0.8  # m/s less and rad/s beside what was commanded: a slip of the drive, or somebody in the way
+SLOWED, TURNED = 0.35, 0.8  # m/s less than commanded, and rad/s off it, from which a robot is held or turned
 
 
 class Twist(NamedTuple):
@@ -96,8 +96,9 @@ class Progress:
         angular = turned / seconds
         given = [commands.at(pose[0]) for pose in list(self._poses)[:-1]]
         wanted = sum(command.linear for command in given) / WATCHED
-        slowed = math.copysign(1.0, wanted) * (wanted - linear) > SLOWED
+        forth = math.copysign(1.0, wanted)
+        slowed = forth * (wanted - linear) > SLOWED
         if not slowed and abs(angular - sum(command.angular for command in given) / WATCHED) < TURNED:
             return None
-        slower = min(max(math.copysign(1.0, wanted) * linear, 0.0), abs(wanted))
-        return Twist(math.copysign(slower, wanted), min(max(angular, -self._turn), self._turn))
+        slower = min(max(forth * linear, 0.0), abs(wanted))
+        return Twist(forth * slower, min(max(angular, -self._turn), self._turn))
