@@ -5,7 +5,7 @@ tracker:
   inputs: {people: triage/people, near: simulator/near, obstacles: triage/planning, pose: localizer/pose}
 
 `near`, of a second sensor for the ring in which the lidar is blind, may be left out, and `obstacles` with it. Nobody
-labels its points: there, what stands where the lidar saw no obstacle before is a person.
+labels its points: there, what stands where the lidar saw no obstacle before, and is not flat, is a person.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from graph.contract import Operator, Summary
 from graph.geometry import planar, transform
 from graph.messages import PointCloud, Pose, Tracks
 from operators.pointmap.rehearsal import room_scan
+from operators.tracking.flat import flat
 from operators.tracking.things import Things
 from operators.tracking.tracker import Habits, looking
 from operators.tracking.tracker import Tracker as Tracking
@@ -103,8 +104,11 @@ class Tracker(Operator):
         self.tracking.habits = self.habits
         if near is not None:
             self.tracking.habits = looking(self.habits)
+            if obstacles is not None:
+                self._learn(points, obstacles, pose)
             points = points[_away(points, eye) >= NEAR]
-            points = np.concatenate([points, self._unexplained(near, obstacles, pose)])
+            points = points[~self.things.explain(points[:, :2], pose.measured_at / SECOND, beside=False)]
+            points = np.concatenate([points, self._unexplained(near, pose)])
         seconds = 0.0 if self._last is None else (pose.measured_at - self._last) / SECOND
         self._last = pose.measured_at
         people = self.tracking.observe(points, (float(eye[0]), float(eye[1])), seconds)
@@ -121,16 +125,21 @@ class Tracker(Operator):
             )
         )
 
-    def _unexplained(self, near: PointCloud, obstacles: PointCloud | None, pose: Pose) -> Floats:
-        """Return the second sensor's points (n, 3; world) at nothing that is known to stand there."""
+    def _learn(self, people: Floats, obstacles: PointCloud, pose: Pose) -> None:
+        """Take in where obstacles and people (n, 3; world) are around the robot."""
+        seconds, here = pose.measured_at / SECOND, pose.world_from_base[:2, 3]
+        places = transform(pose.world_from_base @ obstacles.base_from_lidar, obstacles.points.astype(np.float64))
+        for seen, say in ((places, self.things.observe), (people, self.things.doubt)):
+            away = _away(seen, here)
+            say(seen[away < CLEAR, :2], seconds, LATE)
+            say(seen[(away >= CLEAR) & (away < THINGS), :2], seconds, SOON)
+
+    def _unexplained(self, near: PointCloud, pose: Pose) -> Floats:
+        """Return the second sensor's points (n, 3; world) at nothing that is flat or known to stand there."""
         seconds = pose.measured_at / SECOND
-        if obstacles is not None:
-            places = transform(pose.world_from_base @ obstacles.base_from_lidar, obstacles.points.astype(np.float64))
-            away = _away(places, pose.world_from_base[:2, 3])
-            self.things.observe(places[away < CLEAR, :2], seconds, LATE)
-            self.things.observe(places[(away >= CLEAR) & (away < THINGS), :2], seconds, SOON)
         points = _standing(near, pose)
         points = points[_away(points, (pose.world_from_base @ near.base_from_lidar)[:2, 3]) < NEAR]
+        self.things.observe(points[flat(np.ascontiguousarray(points[:, :2])), :2], seconds)
         return np.asarray(points[~self.things.explain(points[:, :2], seconds)])
 
     def on_end(self) -> Summary:

@@ -303,6 +303,38 @@ def test_who_passes_is_no_thing_even_if_taken_for_one_now_and_then():
     assert things.explain(np.array([[5.0 * CELL, 1.0]]), 4.0).all()
 
 
+def test_who_is_mostly_taken_for_somebody_is_no_thing():
+    things, place = Things(), np.array([[2.05, 0.05]])
+    for step in range(60):
+        (things.observe if step % 5 == 0 else things.doubt)(place, 0.1 * step, 4)
+        assert not things.explain(place, 0.1 * step).any()
+    for step in range(60, 70):
+        things.observe(place, 0.1 * step, 4)
+    assert things.explain(place, 7.0).all()
+    things.doubt(place, 7.1, 4)  # once
+    assert things.explain(place, 7.1).all()
+    assert things.explain(place + np.array([CELL, 0.0]), 7.1).all()
+    assert not things.explain(place + np.array([CELL, 0.0]), 7.1, beside=False).any()
+
+
+@pytest.mark.parametrize("chair", [True, False])
+def test_a_few_wrong_labels_make_nobody_of_a_chair_and_no_chair_of_somebody(chair):
+    """What stands 2 m away is taken for the other in four frames in a row, after twelve in which it is not."""
+    random, tracker, found = np.random.default_rng(4), Tracker(), []
+    nothing = np.zeros((0, 3), np.float32)
+    for step in range(64):
+        stamped = {"measured_at": step * 100_000_000, "base_from_lidar": MOUNT}
+        seen = seen_by([(2.0, 0.3)], nearest=0.9, farthest=30.0, random=random)
+        obstacle = chair == (step % 16 < 12)
+        tracker.on_people(PointCloud(points=nothing if obstacle else seen, **stamped))
+        tracker.on_obstacles(PointCloud(points=seen if obstacle else nothing, **stamped))
+        tracker.on_near(PointCloud(points=nothing, **stamped))
+        found.append(
+            len(tracker.on_pose(Pose(measured_at=step * 100_000_000, world_from_base=np.eye(4))).tracks.identity)
+        )
+    assert set(found[8:]) == {0 if chair else 1}
+
+
 def test_near_without_obstacles_is_warned_of():
     wired = frozenset({"people", "near", "pose"})
     assert "near wants obstacles" in Tracker.missing(Tracker.Config(), wired)

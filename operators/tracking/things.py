@@ -13,6 +13,7 @@ CELL = 0.1  # metres
 SIDE = 64  # cells of the torus: more than a frame reaches, so that no two of its places fall together
 KEPT = 20.0  # seconds for which a cell is filled that nobody looks at again
 SURE = 20  # by which weight of sightings something stands in a cell: who passes is not there for so long
+MOST = 40  # weight that a cell can have: a few frames in which it is taken for somebody do not make it so
 AROUND = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1)]
 
 
@@ -29,15 +30,23 @@ class Things:
         cell = np.unique(np.floor(places / CELL).astype(np.int64), axis=0)
         row, column = (cell % SIDE).T
         known = self._known(cell, row, column, seconds)
-        self._weight[row, column] = np.minimum(np.where(known, self._weight[row, column], 0) + weight, SURE)
+        self._weight[row, column] = np.minimum(np.where(known, self._weight[row, column], 0) + weight, MOST)
         self._cell[row, column] = cell
         self._seen[row, column] = seconds
 
-    def explain(self, places: Floats, seconds: float) -> Flags:
-        """Say which places (n, 2), seen at a time, lie in a filled cell or beside one; the cells are seen again."""
+    def doubt(self, places: Floats, seconds: float, weight: int) -> None:
+        """Take in that somebody was seen at places (n, 2) at a time: less is said for things there."""
+        cell = np.unique(np.floor(places / CELL).astype(np.int64), axis=0)
+        row, column = (cell % SIDE).T
+        known = self._known(cell, row, column, seconds)
+        row, column = row[known], column[known]
+        self._weight[row, column] = np.maximum(self._weight[row, column] - weight, 0)
+
+    def explain(self, places: Floats, seconds: float, *, beside: bool = True) -> Flags:
+        """Say which places (n, 2), seen at a time, lie in a filled cell, or beside one; the cells are seen again."""
         cell = np.floor(places / CELL).astype(np.int64)
         explained = np.zeros(len(places), np.bool_)
-        for step in AROUND:
+        for step in AROUND if beside else [(0, 0)]:
             there = cell + step
             row, column = (there % SIDE).T
             here = self._known(there, row, column, seconds) & (self._weight[row, column] >= SURE)
