@@ -13,7 +13,7 @@ Where the tracker has a second sensor, it goes by the tracks alone.
 from __future__ import annotations
 
 from collections import deque
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -43,6 +43,7 @@ class Planner(Operator):
         max_turn: float = 1.0  # rad/s
         acceleration: float = 1.0  # m/s^2
         turn_acceleration: float = 2.5  # rad/s^2
+        braking: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0  # m/s^2, towards rest
         length: float = 0.42  # metres, of the footprint
         width: float = 0.31  # metres
         padding: float = 0.05  # metres kept free around it
@@ -65,7 +66,7 @@ class Planner(Operator):
         c: Planner.Config = self.config
         self.navigator = Navigator(
             Footprint(c.length, c.width),
-            Limits(c.max_speed, c.max_reverse, c.max_turn, c.acceleration, c.turn_acceleration),
+            Limits(c.max_speed, c.max_reverse, c.max_turn, c.acceleration, c.turn_acceleration, c.braking),
             padding=c.padding,
             inflation=c.inflation,
             side=c.window,

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -47,6 +48,7 @@ class Simulator(Operator):
         rolling: bool | None = None  # columns one after the other over the scan period; None: as the lidar says
         dropout: float | None = None  # share of returns lost at grazing incidence and far away, at most
         odometry: OdometryNoise = OdometryNoise()
+        braking: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0  # m/s^2 at most, towards rest
         goal_radius: float = 0.9  # metres between the robot's own estimate and a target that it reaches
         patience: float = 5.0  # the tour ends after so many times its free driving time
 
@@ -72,6 +74,7 @@ class Simulator(Operator):
             rolling=c.rolling,
             dropout=c.dropout,
             odometry=c.odometry,
+            braking=c.braking,
         )
         self.referee = Referee(self.world.targets, self.world.length, patience=c.patience, radius=c.goal_radius)
         self.command = (0.0, 0.0)  # in force at the last tick

@@ -44,7 +44,7 @@ class Motion(NamedTuple):
 class Physics:
     """One PyBullet world without a window. Everything is added in a fixed order, so that runs are equal to the bit."""
 
-    def __init__(self, bodies: list[Body], start: tuple[float, float, float]) -> None:
+    def __init__(self, bodies: list[Body], start: tuple[float, float, float], *, braking: float = ACCELERATION) -> None:
         self.client = p.connect(p.DIRECT)
         weakref.finalize(self, _disconnect, self.client)
         p.setGravity(0, 0, -9.81, physicsClientId=self.client)
@@ -55,6 +55,7 @@ class Physics:
         self.still = {self._still(body): index for index, body in enumerate(bodies)}  # PyBullet's number: body
         self.robot = self._robot(start)
         self.command = (0.0, 0.0)
+        self.braking = braking  # m/s^2
         self.target = [0.0, 0.0]  # linear, angular, after the acceleration limits
         self.people: dict[int, list[int]] = {}  # person: capsule bodies
         self.owner: dict[int, int] = {}  # capsule body: person
@@ -131,8 +132,9 @@ class Physics:
 
     def step(self) -> None:
         """Advance by SUBSTEP."""
-        for index, limit in enumerate((ACCELERATION * SUBSTEP, TURN_ACCELERATION * SUBSTEP)):
+        for index, most in enumerate((ACCELERATION, TURN_ACCELERATION)):
             gap = self.command[index] - self.target[index]
+            limit = (self.braking if index == 0 and gap * self.target[index] < 0.0 else most) * SUBSTEP
             self.target[index] += min(max(gap, -limit), limit)
         self._motors()
         p.stepSimulation(physicsClientId=self.client)

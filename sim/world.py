@@ -26,7 +26,7 @@ from sim.inspection import require
 from sim.layout import RESOLUTION, Seat, draw
 from sim.lidar import NOTHING, Hits, Lidar, LidarSpec, People, lidar_named
 from sim.odometry import Odometer, OdometryNoise
-from sim.physics import GLIDE, SUBSTEP, Physics
+from sim.physics import ACCELERATION, GLIDE, SUBSTEP, Physics
 from sim.scenario import Scenario, load_scenario
 from sim.solids import Body, Box, Prism, Truth, triangles_of
 from sim.sweep import along
@@ -95,6 +95,7 @@ class World:
         rolling: bool | None = None,
         dropout: float | None = None,
         odometry: OdometryNoise | None = None,
+        braking: float = ACCELERATION,
     ) -> None:
         self.building: Building = building if isinstance(building, Building) else load(building)
         self.scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
@@ -110,7 +111,7 @@ class World:
         triangles, owner = triangles_of(self.bodies)
         self.lidar = Lidar(self.spec, triangles, owner)
         self.near = None if near is None else Lidar(lidar_named(near), triangles, owner)
-        self.physics = Physics(self.layout.bodies, self.start)
+        self.physics = Physics(self.layout.bodies, self.start, braking=braking)
         self.noise = np.random.default_rng([seed, 3])
         self.noise_near = np.random.default_rng([seed, 5])
         shadows = [_shadow(seat) for seat in self.layout.seats]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from operators.navigation.distance import distance_to
 from operators.navigation.footprint import Footprint, Surroundings, inside, room
 from operators.navigation.lattice import Lattice
-from operators.navigation.motion import Commands, Progress, Twist, advance, towards
+from operators.navigation.motion import Commands, Progress, Twist, advance, paced, towards
 from operators.navigation.search import cost_to_go
 from operators.navigation.window import DynamicWindow, Limits, way_around
 
@@ -85,6 +85,34 @@ def test_velocities_change_by_little(now, wanted, most):
     result = towards(now, wanted, most)
     assert abs(result - now) <= most + 1e-12
     assert abs(result - wanted) <= abs(now - wanted) + 1e-12
+
+
+@given(st.floats(-2, 2), st.floats(-2, 2), st.floats(0.01, 0.5), st.floats(1.0, 4.0))
+def test_brakes_are_stronger_than_the_motor_and_work_towards_rest(now, wanted, faster, times):
+    slower = times * faster
+    assert paced(now, wanted, faster, faster) == towards(now, wanted, faster)
+    result = paced(now, wanted, faster, slower)
+    assert paced(-now, -wanted, faster, slower) == -result
+    assert min(now, wanted) <= result <= max(now, wanted)
+    assert abs(result - now) <= slower + 1e-12
+    if abs(result) > abs(now):
+        assert abs(result - now) <= faster + 1e-12
+    if abs(now) >= slower and wanted * now <= 0.0:
+        assert abs(result) == pytest.approx(abs(now) - slower)
+
+
+def test_who_brakes_harder_may_drive_faster_towards_somebody():
+    lattice = Lattice(0.1, -60, -60, 120, 120)
+    row, column = lattice.cell(5.0, 0.0)
+    field = cost_to_go(np.full((120, 120), 8, np.int32), np.array([row * 120 + column]))
+    way = way_around(field, lattice, 0.0, 0.0, 4.0, 0.1 / (8 * 24) / 1.3)
+    across = np.array([[1.3, y, 0.0, 0.0] for y in np.arange(-1.5, 1.6, 0.3)])  # a row of people
+    room = Surroundings(np.full((80, 80), 1.0, np.float32), 0.05, -2.0, -2.0)
+    chosen = []
+    for braking in (1.0, 2.5):
+        window = DynamicWindow(Footprint(), Limits(braking=braking))
+        chosen.append(window.choose((0.0, 0.0, 0.0), Twist(0.5, 0.0), room, way, top_speed=1.3, walkers=across))
+    assert chosen[1].target.linear > chosen[0].target.linear + 0.1
 
 
 @pytest.mark.parametrize("latency", [0.0, 0.1, 0.25, 0.3])

@@ -91,6 +91,23 @@ def test_no_command_exceeds_what_the_robot_can() -> None:
     assert world.motion.angular == pytest.approx(TOP_TURN, abs=0.03)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_brakes_slow_the_robot_as_hard_as_they_are_and_change_nothing_else(sign: float) -> None:
+    way = {}
+    for braking in (1.0, 2.5):
+        world = World(box_room(30.0, 12.0), NOBODY, "A", 0, braking=braking)
+        for _ in range(15):
+            world.advance(sign, 0.3)
+        reached = world.motion.world_from_base.copy()
+        assert sign * world.motion.linear == pytest.approx(1.0, abs=0.02)
+        for _ in range(15):
+            world.advance(0.0, 0.0)
+        way[braking] = reached, float(np.hypot(*(world.motion.world_from_base - reached)[:2, 3]))
+    assert np.array_equal(way[1.0][0], way[2.5][0])
+    assert way[1.0][1] == pytest.approx(0.5 / 1.0, abs=0.04)
+    assert way[2.5][1] == pytest.approx(0.5 / 2.5, abs=0.04)
+
+
 def test_walls_stop_the_robot_and_count_once() -> None:
     world = World(box_room(6.0, 6.0), NOBODY, "A", 0)
     for _ in range(60):

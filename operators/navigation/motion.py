@@ -36,6 +36,14 @@ def towards(now: float, wanted: float, most: float) -> float:
     return min(max(wanted, now - most), now + most)
 
 
+@njit(cache=True)
+def paced(now: float, wanted: float, faster: float, slower: float) -> float:
+    """Change a speed towards another, by at most `faster` away from rest and `slower` towards it."""
+    least = now - faster if now <= 0.0 else (now - slower if now >= slower else min(now - faster, 0.0))
+    most = now + faster if now >= 0.0 else (now + slower if now <= -slower else max(now + faster, 0.0))
+    return min(max(wanted, least), most)
+
+
 class Commands:
     """The commands given, each of which takes effect `latency` seconds after the measurement that it answers."""
 

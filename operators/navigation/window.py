@@ -16,7 +16,7 @@ from numba import njit
 
 from operators.navigation.footprint import Body, Footprint, Surroundings, room
 from operators.navigation.lattice import Lattice
-from operators.navigation.motion import Twist, advance, towards
+from operators.navigation.motion import Twist, advance, paced, towards
 from operators.navigation.people import NOBODY, Walkers, nearby, surcharge, toll
 from operators.navigation.search import UNREACHED, Field
 
@@ -31,6 +31,7 @@ SWERVE_COST = 0.05  # seconds for each rad/s that the turn differs from the last
 REVERSE_COST = 1.0  # seconds a second: the robot sees backwards as well, but is not meant to drive so
 NOWHERE = 1e3  # seconds left from where no way leads to the goal
 EVADING = 0.6  # m/s backwards, to get out of somebody's way
+AMONG_PEOPLE = 15  # speeds to try there, finer the slower: where little is allowed, little more counts
 WALKERS_WITHIN = 5.0  # metres: what both can walk and drive in 2 s
 LOOK_AHEAD = 6  # cells of the search that the way is followed to find its direction
 
@@ -43,6 +44,7 @@ class Limits(NamedTuple):
     turn: float = 1.0  # rad/s
     acceleration: float = 1.0  # m/s^2
     turn_acceleration: float = 2.5  # rad/s^2
+    braking: float = 1.0  # m/s^2, towards rest
 
 
 class Choice(NamedTuple):
@@ -143,7 +145,7 @@ def _roll(
     """Fill in poses (steps + 1, 3) and the rest (steps + 1,); return the last step before a touch."""
     speed, turn, worst = speeds[0], turns[0], 0.0
     for k in range(1, len(poses)):
-        speed = towards(speed, wanted[0], limits.acceleration * STEP)
+        speed = paced(speed, wanted[0], limits.acceleration * STEP, limits.braking * STEP)
         turn = towards(turn, wanted[1], limits.turn_acceleration * STEP)
         x, y, yaw = advance(poses[k - 1, 0], poses[k - 1, 1], poses[k - 1, 2], speed, turn, STEP)
         poses[k, 0], poses[k, 1], poses[k, 2] = x, y, yaw
@@ -153,7 +155,7 @@ def _roll(
             return k - 1
         if len(walkers):
             tolls[k], into = toll(walkers, body.half, k * STEP, (x, y, yaw), speed, turn, limits.speed)
-            if into and abs(speed) > abs(speeds[k - 1]) - 0.9 * limits.acceleration * STEP:  # and does not brake
+            if into and abs(speed) > abs(speeds[k - 1]) - 0.9 * limits.braking * STEP:  # and does not brake
                 return k - 1
             soon, met = surcharge(walkers, body.circumscribed, k * STEP, x, y, yaw, speed)
             worst = max(worst, met)
@@ -189,7 +191,7 @@ def _judge(
             spent += STEP * (CLOSE_COST * closeness * closeness * pace / limits.speed + HASTE_COST * haste)
         if speeds[k] < 0.0:
             spent += STEP * REVERSE_COST
-        if to_touch < pace * pace / (2.0 * limits.acceleration):
+        if to_touch < pace * pace / (2.0 * limits.braking):
             continue  # too late to stop
         row = math.floor((poses[k, 1] - way.y) / way.resolution)
         column = math.floor((poses[k, 0] - way.x) / way.resolution)
@@ -287,15 +289,17 @@ class DynamicWindow:
         """
         speeds, turns = self._samples
         reverse = [-min(self.limits.reverse, top_speed)]
+        forward = np.linspace(0.0, top_speed, speeds)
         walkers = nearby(walkers, pose[0], pose[1], WALKERS_WITHIN)
         if len(walkers):  # who comes towards the robot is faster than it backs off otherwise
             reverse.append(-min(EVADING, top_speed))
+            forward = top_speed * np.linspace(0.0, 1.0, AMONG_PEOPLE) ** 1.5
         best, speed, turn, trajectory = _choose(
             pose,
             now.linear,
             now.angular,
             self._turn_before,
-            np.concatenate([reverse, np.linspace(0.0, top_speed, speeds)]),
+            np.concatenate([reverse, forward]),
             np.linspace(-self.limits.turn, self.limits.turn, turns),
             self.steps,
             self.limits,
