@@ -78,10 +78,11 @@ def test_graph_of_every_session_is_without_mistakes(tmp_path, labels, people):
     operators = yaml.safe_load(path.read_text())["operators"]
     assert ("segmenter" in operators) == (labels != "none")
     assert ("tracker" in operators) == (people == "predict" and labels != "none")
-    near = {"near": "blindspot"} if people == "predict" else {}
+    near = {"near": "blindspot", "braking": 2.5} if people == "predict" else {}
     wanted = {"building": BUILDING, "scenario": "hard", "tour": "A", "seed": 7} | near
     assert operators["simulator"]["config"] == wanted
-    assert operators["planner"]["config"] == {"people": people}
+    brakes = {"braking": 2.5} if people == "predict" else {}
+    assert operators["planner"]["config"] == {"people": people} | brakes
 
 
 def test_one_planner_with_one_set_of_parameters_in_all_rounds():

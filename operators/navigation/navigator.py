@@ -13,12 +13,13 @@ from graph.geometry import Matrix, wrap, yaw
 from operators.navigation.costmap import CELL, COARSE, FREE, Costmap
 from operators.navigation.footprint import Footprint, Surroundings
 from operators.navigation.lattice import Lattice
-from operators.navigation.motion import Commands, Progress, Twist, advance, towards
+from operators.navigation.motion import Commands, Progress, Twist, advance, paced, towards
 from operators.navigation.people import NOBODY, Stubborn, Walkers, crowd
 from operators.navigation.search import UNIT, UNREACHED, Field, cost_to_go, trace
 from operators.navigation.window import STEP, DynamicWindow, Limits, way_around
 
 REPLAN = 5  # periods between two searches
+HELD = 3.0  # metres of the present way to which the robot rather keeps among people
 BEYOND = 3.0  # metres of open floor by which a search goes on past the robot, to cover its window
 ARRIVED = 0.25  # metres from the target at which the robot stops
 NEARBY = 0.75  # metres around a target that is itself blocked: a place there serves, the goal's radius being 0.9
@@ -140,7 +141,7 @@ class Navigator:
         limits = self.limits
         wanted, status, trajectory = self._choose(measured, pose, now, limits.speed if valid else CAREFUL_SPEED)
         twist = Twist(
-            towards(now.linear, wanted.linear, limits.acceleration * STEP),
+            paced(now.linear, wanted.linear, limits.acceleration * STEP, limits.braking * STEP),
             towards(now.angular, wanted.angular, limits.turn_acceleration * STEP),
         )
         self.commands.give(measured_at, twist)
@@ -211,7 +212,8 @@ class Navigator:
             weights = self.costmap.weights(pose[:2], seen=seen)
             sources, costs = self._sources(weights, lattice, per_metre)
             if len(self._walkers):
-                crowd(weights, lattice.resolution, *lattice.origin, self._walkers, self._stays)
+                held = self._path[: round(HELD / lattice.resolution)]
+                crowd(weights, lattice.resolution, *lattice.origin, self._walkers, self._stays, held)
             field = cost_to_go(weights, sources, costs, start=start, margin=round(BEYOND * per_metre))
             found = field.cost[start] != UNREACHED
             if found:

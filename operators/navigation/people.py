@@ -13,15 +13,16 @@ import numpy.typing as npt
 from numba import njit
 
 Flags = npt.NDArray[np.bool_]
+Planar = tuple[float, float, float]  # x, y in metres, yaw in radians
 Walkers = npt.NDArray[np.float64]  # (k, 4): x, y in metres, velocity along x and y in m/s, now
 
 BODY = 0.22  # metres from the middle of a person to its side
 STRIDE = 0.30  # metres that feet swing ahead and behind besides, at a walk
 WALK = 0.6  # m/s at which they do so fully
 KEPT = 0.07  # metres kept free between a person and the robot's outline
-AHEAD = 0.25  # seconds: and as far as the robot comes nearer in that time, for feet that are elsewhere than thought
+AHEAD = 0.2  # seconds: and as far as the robot comes nearer in that time, for feet that are elsewhere than thought
 SLOWLY = 0.25  # m/s up to which that is enough
-HASTY = 0.2  # seconds: a faster robot leaves room for what it exceeds SLOWLY by in that time, beside people as well
+HASTY = 0.08  # seconds: a faster robot leaves room for what it exceeds SLOWLY by in that time, beside people as well
 AWAY = 0.3  # share of its speed at which the gap must grow for that room not to be asked for
 LAG = 0.2  # seconds by which a track is late to say that somebody has stopped
 EASY = 0.55  # metres from which passing a person costs nothing
@@ -31,14 +32,16 @@ PERSON_COST = 3.0  # seconds for each second's way at full speed with no room at
 NEAR = 0.25  # metres: nearer, even a robot that stands is better elsewhere
 NEAR_COST = 1.5  # seconds a second with no room at all
 RETREAT = 0.3  # of that while the robot makes off
-GENTLE, SPEED_PER_METRE = 0.30, 2.0  # m/s towards somebody with no room, and m/s more for each metre of it
-PASSING_SPEED_PER_METRE = 3.0  # the same for who passes somebody
+GENTLE, SPEED_PER_METRE = 0.45, 2.5  # m/s towards somebody with no room, and m/s more for each metre of it
+PASSING_SPEED_PER_METRE = 4.0  # the same for who passes somebody
 HURRY_COST = 4.0  # seconds a second, at twice the speed that the room allows
 COMING = 0.6  # seconds within which who comes towards a robot makes it give way
 COMES = 0.4  # m/s from which somebody walks
 COMING_ROOM = 0.1  # metres that shall be left then
 COMING_COST = 8.0  # seconds for each metre of it that is missing
 CROWDED = 8  # weight, besides the 8 of open floor, of a cell where somebody stands, falling with the distance squared
+YIELDED = 0.3  # share of that on the way that the robot is on
+OURS = 2  # cells to each side of it
 BODILY = 600  # weight where somebody stands who does not step aside
 STUBBORN, STANDS = 0.66, 0.3  # metres from the robot's middle and m/s: who is nearer and slower does not step aside
 REMEMBERED = 200  # periods for which that is expected of them
@@ -52,33 +55,28 @@ NOBODY: Walkers = np.zeros((0, 4))
 
 @njit(cache=True)
 def person_room(
-    walkers: Walkers, half: tuple[float, float], seconds: float, x: float, y: float, yaw: float
+    walker: npt.NDArray[np.float64], half: tuple[float, float], seconds: float, feet: float, pose: Planar
 ) -> tuple[float, float, float, float, float]:
-    """Return the metres between the robot's outline at a pose and the nearest walker's side after some seconds.
+    """Return the metres between the robot's outline at a pose and the side of somebody (4,) who walks for some seconds.
 
-    half: of the robot's length and width, metres. A walker may as well have stopped. Infinite without walkers. Besides,
-    in the robot's frame: the unit vector to the walker, and the point of the outline that is nearest to it.
+    half: of the robot's length and width, metres; feet: share of a stride that feet swing ahead and behind; pose: x, y
+    in metres, yaw. Besides, in the robot's frame: the unit vector to the walker, and the point of the outline that is
+    nearest to it.
     """
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    least, along, across, front, side = math.inf, 1.0, 0.0, half[0], 0.0
-    for index in range(len(walkers)):
-        vx, vy = walkers[index, 2], walkers[index, 3]
-        speed = math.sqrt(vx * vx + vy * vy)
-        swing = STRIDE * min(1.0, speed / WALK)
-        forward, left = (vx / speed, vy / speed) if speed > 1e-6 else (1.0, 0.0)
-        for share in range(2):
-            later = seconds if share == 1 else -LAG
-            ahead, aside = walkers[index, 0] + later * vx - x, walkers[index, 1] + later * vy - y
-            foot = share * min(swing, max(-swing, -(ahead * forward + aside * left)))  # who stands has feet together
-            ahead, aside = ahead + foot * forward, aside + foot * left
-            ahead, aside = cosine * ahead + sine * aside, cosine * aside - sine * ahead
-            px, py = min(half[0], max(-half[0], ahead)), min(half[1], max(-half[1], aside))
-            away = math.sqrt((ahead - px) ** 2 + (aside - py) ** 2)
-            if away - BODY < least:
-                least = away - BODY
-                if away > 1e-6:
-                    along, across, front, side = (ahead - px) / away, (aside - py) / away, px, py
-    return least, along, across, front, side
+    vx, vy = walker[2], walker[3]
+    speed = math.sqrt(vx * vx + vy * vy)
+    ahead, aside = walker[0] + seconds * vx - pose[0], walker[1] + seconds * vy - pose[1]
+    if speed > 1e-6:
+        swing = feet * STRIDE * min(1.0, speed / WALK)
+        foot = min(swing, max(-swing, -(ahead * vx + aside * vy) / speed))
+        ahead, aside = ahead + foot * vx / speed, aside + foot * vy / speed
+    cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+    ahead, aside = cosine * ahead + sine * aside, cosine * aside - sine * ahead
+    px, py = min(half[0], max(-half[0], ahead)), min(half[1], max(-half[1], aside))
+    away = math.sqrt((ahead - px) ** 2 + (aside - py) ** 2)
+    if away < 1e-6:
+        return -BODY, 1.0, 0.0, half[0], 0.0
+    return away - BODY, (ahead - px) / away, (aside - py) / away, px, py
 
 
 @njit(cache=True)
@@ -86,7 +84,7 @@ def toll(
     walkers: Walkers,
     half: tuple[float, float],
     seconds: float,
-    pose: tuple[float, float, float],
+    pose: Planar,
     speed: float,
     turn: float,
     top_speed: float,
@@ -94,28 +92,43 @@ def toll(
     """Return what a moment of driving costs near people, in seconds a second, and whether it drives into somebody.
 
     half: of the robot's length and width, metres; seconds: from now; pose: x, y, yaw; speed: m/s, forward; turn: rad/s,
-    to the left.
+    to the left. Everybody may go on, or have stopped LAG ago; who goes on makes way as fast as they leave.
     """
-    gap, along, across, front, side = person_room(walkers, half, min(seconds, BELIEVED), *pose)
-    if gap >= EASY:
-        return 0.0, False
     pace = abs(speed)
-    approach = (speed - turn * side) * along + turn * front * across
     haste = max(0.0, pace - SLOWLY)
-    moves = approach > 0.02 or (haste > 0.0 and approach > -AWAY * pace)
-    if moves and seconds <= CERTAIN and gap < KEPT + AHEAD * max(approach, 0.0) + HASTY * haste:
-        return 0.0, True
+    cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+    least, towards = math.inf, 0.0
+    for index in range(len(walkers)):
+        walker = walkers[index]
+        for goes in range(2):
+            later = min(seconds, BELIEVED) if goes else -LAG
+            gap, along, across, front, side = person_room(walker, half, later, float(goes), pose)
+            if gap >= EASY:
+                continue
+            approach = (speed - turn * side) * along + turn * front * across
+            if goes:
+                leaves = (cosine * walker[2] + sine * walker[3]) * along + (
+                    cosine * walker[3] - sine * walker[2]
+                ) * across
+                approach -= min(max(leaves, 0.0), max(approach, 0.0))
+            if gap < least:
+                least, towards = gap, approach
+            moves = approach > 0.02 or (haste > 0.0 and approach > -AWAY * pace)
+            if moves and seconds <= CERTAIN and gap < KEPT + AHEAD * max(approach, 0.0) + HASTY * haste:
+                return 0.0, True
+    if least >= EASY:
+        return 0.0, False
     sure = max(0.0, 1.0 - seconds / BELIEVED)
-    room = max(gap, 0.0)
+    room = max(least, 0.0)
     closeness = (EASY - room) / EASY
     cost = 0.0
-    if gap < NEAR:
-        cost += NEAR_COST * (NEAR - max(gap, -NEAR)) / NEAR
-    if approach < -0.5 * pace:
+    if least < NEAR:
+        cost += NEAR_COST * (NEAR - max(least, -NEAR)) / NEAR
+    if towards < -0.5 * pace:
         return RETREAT * sure * cost, False
     cost += PERSON_COST * closeness * closeness * pace / top_speed
-    if approach > 0.0:
-        cost += HURRY_COST * max(0.0, approach / (GENTLE + SPEED_PER_METRE * room) - 1.0)
+    if towards > 0.0:
+        cost += HURRY_COST * max(0.0, towards / (GENTLE + SPEED_PER_METRE * room) - 1.0)
     cost += HURRY_COST * max(0.0, pace / (GENTLE + PASSING_SPEED_PER_METRE * room) - 1.0)
     return sure * cost, False
 
@@ -156,12 +169,18 @@ def crowd(
     bottom: float,
     walkers: Walkers,
     stays: Flags,
+    held: npt.NDArray[np.float64],
 ) -> None:
     """Add to the weights of a search what it costs to pass people; what is blocked stays so.
 
     weights: (rows, columns), on cells of `resolution` metres from the corner `left`, `bottom`, metres; stays: (k,) who
-    does not step aside: there another way is sought. Most people do, and cost little.
+    does not step aside: there another way is sought. Most people do, and cost little. held: (n, 2) places of the way
+    that the robot is on, metres, where they cost less still: between ways that are equal it does not change its mind.
     """
+    ours = np.zeros(weights.shape, np.bool_)
+    for index in range(len(held)):
+        r, c = math.floor((held[index, 1] - bottom) / resolution), math.floor((held[index, 0] - left) / resolution)
+        ours[max(r - OURS, 0) : max(r + OURS + 1, 0), max(c - OURS, 0) : max(c + OURS + 1, 0)] = True
     reach = math.ceil(PASSING[1] / resolution)
     for index in range(len(walkers)):
         speed = math.sqrt(walkers[index, 2] ** 2 + walkers[index, 3] ** 2)
@@ -174,7 +193,8 @@ def crowd(
                 if weights[r, c] <= 0 or away >= PASSING[1]:
                     continue
                 closeness = min(1.0, (PASSING[1] - away) / (PASSING[1] - PASSING[0]))
-                weights[r, c] += int(CROWDED * share * closeness * closeness)
+                crowded = CROWDED * share * closeness * closeness
+                weights[r, c] += int(crowded * YIELDED if ours[r, c] else crowded)
                 if stays[index] and away < PASSING[0]:
                     weights[r, c] += int(BODILY * share)
 

@@ -17,6 +17,7 @@ Graph = dict[str, Any]  # a graph file's content
 
 PLAYBACK = "graph.playback:operators.simulator.Simulator"
 NEAR = "blindspot"  # the second lidar of a robot that predicts people
+BRAKING = 2.5  # m/s^2: and its brakes
 SEGMENTERS = {"network": "operators.segmenter:Segmenter", "truth": "operators.segmenter:TrueSegmenter"}
 
 
@@ -55,7 +56,8 @@ def session_graph(
         operators["localizer"]["config"] = {"map": map_file}
     operators["planner"]["config"]["people"] = session.people
     if session.people == "predict":
-        operators["simulator"]["config"]["near"] = NEAR
+        operators["simulator"]["config"] |= {"near": NEAR, "braking": BRAKING}
+        operators["planner"]["config"]["braking"] = BRAKING
     with_labels(graph, session.labels, weights=weights, threads=threads, voxel=voxel)
     if session.people == "ignore":
         without_tracker(graph)
