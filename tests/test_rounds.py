@@ -355,7 +355,7 @@ def test_each_round_uses_the_latest_map_and_network(stubs, tmp_path):
     assert graphs["round-2-easy-A"]["localizer"]["config"] == {"map": "../round-1/annotation/map.ply"}
     assert graphs["round-2-easy-A"]["segmenter"]["config"] == {"weights": "../round-1/weights.safetensors"}
     assert graphs["truth-hard-B"]["segmenter"]["run"].endswith("TrueSegmenter")
-    assert graphs["predict-hard-B"]["planner"]["config"] == {"people": "predict"}
+    assert graphs["predict-hard-B"]["planner"]["config"] == {"people": "predict", "braking": 2.5}
 
 
 def test_where_nothing_was_labelled_the_next_round_has_no_network(stubs, tmp_path, monkeypatch):
