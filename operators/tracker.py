@@ -5,7 +5,8 @@ tracker:
   inputs: {people: triage/people, near: simulator/near, obstacles: triage/planning, pose: localizer/pose}
 
 `near`, of a second sensor for the ring in which the lidar is blind, may be left out, and `obstacles` with it. Nobody
-labels its points: there, what stands where the lidar saw no obstacle before, and is not flat, is a person.
+labels its points: there, what stands where the lidar saw no obstacle before, and is not flat, is a person. With both,
+points of people in a cell that is mostly called an obstacle are left out as well.
 """
 
 from __future__ import annotations

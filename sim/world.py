@@ -79,7 +79,7 @@ class State(NamedTuple):
 class World:
     """A session, fixed to the bit by building, scenario, tour and seed. Raises BuildingError for bad input, by name.
 
-    near: a second lidar for the ring in which the first is blind, if there is one.
+    near: a second lidar for the ring in which the first is blind, if there is one. braking: m/s^2, towards rest.
     Instances are the indices of `bodies` (0 is the floor), then the walkers, then the sitters.
     """
 

@@ -10,6 +10,8 @@ from numba import njit
 
 from graph.geometry import wrap
 
+Planar = tuple[float, float, float]  # x, y in metres, yaw in radians
+
 WATCHED = 3  # periods over which poses are held against commands
 SLOWED, TURNED = 0.35, 0.8  # m/s less than commanded, and rad/s off it, from which a robot is held or turned
 
@@ -38,7 +40,7 @@ def towards(now: float, wanted: float, most: float) -> float:
 
 @njit(cache=True)
 def paced(now: float, wanted: float, faster: float, slower: float) -> float:
-    """Change a speed towards another, by at most `faster` away from rest and `slower` towards it."""
+    """Change a speed towards another, by at most `faster` away from rest and `slower` towards it; all in m/s."""
     least = now - faster if now <= 0.0 else (now - slower if now >= slower else min(now - faster, 0.0))
     most = now + faster if now >= 0.0 else (now + slower if now <= -slower else max(now + faster, 0.0))
     return min(max(wanted, least), most)

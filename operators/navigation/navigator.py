@@ -13,7 +13,7 @@ from graph.geometry import Matrix, wrap, yaw
 from operators.navigation.costmap import CELL, COARSE, FREE, Costmap
 from operators.navigation.footprint import Footprint, Surroundings
 from operators.navigation.lattice import Lattice
-from operators.navigation.motion import Commands, Progress, Twist, advance, paced, towards
+from operators.navigation.motion import Commands, Planar, Progress, Twist, advance, paced, towards
 from operators.navigation.people import NOBODY, Stubborn, Walkers, crowd
 from operators.navigation.search import UNIT, UNREACHED, Field, cost_to_go, trace
 from operators.navigation.window import STEP, DynamicWindow, Limits, way_around
@@ -33,9 +33,6 @@ FRESH = 1.0  # metres
 LOOSE = 0.3  # metres from where the robot was wedged
 REST = 200  # periods after which an unreachable target is tried again
 CAREFUL_SPEED = 0.4  # m/s at most, while the localizer is not sure
-
-
-Planar = tuple[float, float, float]  # x, y in metres, yaw in radians
 
 
 class Decision(NamedTuple):

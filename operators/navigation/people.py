@@ -1,7 +1,8 @@
 """People who walk: where they will be when the robot gets there, and how much room they leave it.
 
 A person is a disc, drawn out by its stride, that goes on at constant velocity or stops; with less and less said by that
-as time passes. Nobody is driven into, passing close costs time, and where somebody comes the robot is better elsewhere.
+as time passes. Nobody is driven into, who makes way is followed as fast as they leave, passing close costs time, and
+where somebody comes the robot is better elsewhere.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from operators.navigation.motion import Planar
+
 Flags = npt.NDArray[np.bool_]
-Planar = tuple[float, float, float]  # x, y in metres, yaw in radians
 Walkers = npt.NDArray[np.float64]  # (k, 4): x, y in metres, velocity along x and y in m/s, now
 
 BODY = 0.22  # metres from the middle of a person to its side

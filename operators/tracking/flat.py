@@ -25,7 +25,7 @@ ALONE = 0.85  # share of the points there that lie on it
 
 @njit(cache=True)
 def flat(points: Floats) -> Flags:
-    """Say which points (n, 2; metres) on the floor below what was seen lie on straight upright surfaces."""
+    """Say which (n,) of the points (n, 2; metres), put down on the floor, lie on straight upright surfaces."""
     count = len(points)
     result = np.zeros(count, np.bool_)
     if count < LONG * FEW:

@@ -27,17 +27,15 @@ class Things:
 
     def observe(self, places: Floats, seconds: float, weight: int = SURE) -> None:
         """Take in that something was seen at places (n, 2; world, metres) at a time; each cell counts but once."""
-        cell = np.unique(np.floor(places / CELL).astype(np.int64), axis=0)
-        row, column = (cell % SIDE).T
+        cell, row, column = _cells(places)
         known = self._known(cell, row, column, seconds)
         self._weight[row, column] = np.minimum(np.where(known, self._weight[row, column], 0) + weight, MOST)
         self._cell[row, column] = cell
         self._seen[row, column] = seconds
 
     def doubt(self, places: Floats, seconds: float, weight: int) -> None:
-        """Take in that somebody was seen at places (n, 2) at a time: less is said for things there."""
-        cell = np.unique(np.floor(places / CELL).astype(np.int64), axis=0)
-        row, column = (cell % SIDE).T
+        """Take in that somebody was seen at places (n, 2; world, metres) at a time: less is said for things there."""
+        cell, row, column = _cells(places)
         known = self._known(cell, row, column, seconds)
         row, column = row[known], column[known]
         self._weight[row, column] = np.maximum(self._weight[row, column] - weight, 0)
@@ -59,3 +57,10 @@ class Things:
         """Say which cells (n, 2) have been seen filled, and not too long ago."""
         mine = (self._cell[row, column] == cell).all(axis=1)
         return np.asarray(mine & (seconds - self._seen[row, column] <= KEPT))
+
+
+def _cells(places: Floats) -> tuple[Ints, Ints, Ints]:
+    """Return the cells (m, 2) of places (n, 2; metres), each once, and their rows and columns (m,) on the torus."""
+    cell = np.unique(np.floor(places / CELL).astype(np.int64), axis=0)
+    row, column = (cell % SIDE).T
+    return cell, row, column
