@@ -3,11 +3,12 @@
 planner:
   run: operators.planner:Planner
   inputs: {goal: simulator/goal, map: localizer/occupancy, obstacles: triage/planning, people: triage/people,
-    tracks: tracker/tracks, pose: localizer/pose}
+    tracks: tracker/tracks, things: tracker/things, pose: localizer/pose}
   config: {people: predict}
 
 Where people are predicted and frames are classified, it wants `tracks` and `people`: whose echoes return is not near.
-Where the tracker has a second sensor, it goes by the tracks alone.
+Where the tracker has a second sensor, it goes by the tracks alone, and `things` are what that sensor sees beside the
+robot that is nobody: they are in the way like `obstacles`.
 """
 
 from __future__ import annotations
@@ -76,6 +77,7 @@ class Planner(Operator):
         self._poses: deque[tuple[int, Matrix]] = deque(maxlen=HISTORY)
         self._frames: deque[PointCloud] = deque(maxlen=WAITING)
         self._people: deque[PointCloud] = deque(maxlen=WAITING)
+        self._things: deque[PointCloud] = deque(maxlen=WAITING)
         self._tracks: Tracks | None = None
         self._presence = Presence()
 
@@ -99,6 +101,7 @@ class Planner(Operator):
                     unseen=np.zeros(1, np.float32),
                 )
             )
+            rehearsed.on_things(PointCloud(measured_at=stamp, points=room_scan(), base_from_lidar=mount))
             rehearsed.on_pose(Pose(measured_at=stamp, world_from_base=np.eye(4)))
 
     @classmethod
@@ -122,6 +125,10 @@ class Planner(Operator):
         assert people is not None
         self._people.append(people)
 
+    def on_things(self, things: PointCloud | None) -> None:
+        assert things is not None
+        self._things.append(things)
+
     def on_tracks(self, tracks: Tracks | None) -> None:
         self._tracks = tracks
 
@@ -138,6 +145,11 @@ class Planner(Operator):
                     if people or frame.label is None:  # else nobody knows which rays people gave back
                         points = np.concatenate([frame.points, *people])
                         self._presence.observe(points, where @ frame.base_from_lidar, things)
+        while self._things and self._things[0].measured_at <= pose.measured_at:
+            beside = self._things.popleft()
+            where = self._pose_at(beside.measured_at)
+            if where is not None:
+                self.navigator.stand(beside.points, where @ beside.base_from_lidar)
         if self.config.people == "predict":
             self.navigator.meet(self._walkers(pose.measured_at))
         decision = self.navigator.step(pose.measured_at, pose.world_from_base, valid=pose.valid)

@@ -5,8 +5,9 @@ tracker:
   inputs: {people: triage/people, near: simulator/near, obstacles: triage/planning, pose: localizer/pose}
 
 `near`, of a second sensor for the ring in which the lidar is blind, may be left out, and `obstacles` with it. Nobody
-labels its points: there, what stands where the lidar saw no obstacle before, and is not flat, is a person. With both,
-points of people in a cell that is mostly called an obstacle are left out as well.
+labels its points: there, what stands where the lidar saw no obstacle before, and is not flat, is a person. What is flat
+goes out as `things`: beside the robot, nobody else may have seen it. With both, points of people in a cell that is
+mostly called an obstacle are left out as well.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graph.contract import Operator, Summary
-from graph.geometry import planar, transform
+from graph.geometry import inverse, planar, transform
 from graph.messages import PointCloud, Pose, Tracks
 from operators.pointmap.rehearsal import room_scan
 from operators.tracking.flat import flat
@@ -50,9 +51,10 @@ class Tracker(Operator):
         blind_for: float = 3.0  # seconds that somebody is remembered in the lidar's blind ring
 
     class Outputs(msgspec.Struct):
-        """People."""
+        """People, and what stands beside the robot and is nobody."""
 
         tracks: Tracks | None = None
+        things: PointCloud | None = None
 
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
@@ -102,6 +104,7 @@ class Tracker(Operator):
             return None
         eye = (pose.world_from_base @ cloud.base_from_lidar)[:2, 3]
         points = _standing(cloud, pose)
+        things = None
         self.tracking.habits = self.habits
         if near is not None:
             self.tracking.habits = looking(self.habits)
@@ -109,7 +112,8 @@ class Tracker(Operator):
                 self._learn(points, obstacles, pose)
             points = points[_away(points, eye) >= NEAR]
             points = points[~self.things.explain(points[:, :2], pose.measured_at / SECOND, beside=False)]
-            points = np.concatenate([points, self._unexplained(near, pose)])
+            beside, things = self._told_apart(near, pose)
+            points = np.concatenate([points, beside])
         seconds = 0.0 if self._last is None else (pose.measured_at - self._last) / SECOND
         self._last = pose.measured_at
         people = self.tracking.observe(points, (float(eye[0]), float(eye[1])), seconds)
@@ -123,7 +127,8 @@ class Tracker(Operator):
                 velocity=people.velocity,
                 unseen=people.unseen.astype(np.float32),
                 blind=self.tracking.habits.blind,
-            )
+            ),
+            things,
         )
 
     def _learn(self, people: Floats, obstacles: PointCloud, pose: Pose) -> None:
@@ -135,13 +140,20 @@ class Tracker(Operator):
             say(seen[away < CLEAR, :2], seconds, LATE)
             say(seen[(away >= CLEAR) & (away < THINGS), :2], seconds, SOON)
 
-    def _unexplained(self, near: PointCloud, pose: Pose) -> Floats:
-        """Return the second sensor's points (n, 3; world) at nothing that is flat or known to stand there."""
+    def _told_apart(self, near: PointCloud, pose: Pose) -> tuple[Floats, PointCloud]:
+        """Return the second sensor's points (n, 3; world) at nothing that stands there, and the flat ones."""
         seconds = pose.measured_at / SECOND
         points = _standing(near, pose)
         points = points[_away(points, (pose.world_from_base @ near.base_from_lidar)[:2, 3]) < NEAR]
-        self.things.observe(points[flat(np.ascontiguousarray(points[:, :2])), :2], seconds)
-        return np.asarray(points[~self.things.explain(points[:, :2], seconds)])
+        upright = points[flat(np.ascontiguousarray(points[:, :2]))]
+        self.things.observe(upright[:, :2], seconds)
+        lidar_from_world = inverse(pose.world_from_base @ near.base_from_lidar)
+        things = PointCloud(
+            measured_at=near.measured_at,
+            points=transform(lidar_from_world, upright).astype(np.float32),
+            base_from_lidar=near.base_from_lidar,
+        )
+        return np.asarray(points[~self.things.explain(points[:, :2], seconds)]), things
 
     def on_end(self) -> Summary:
         """Tell how many people were met, and how many were followed at once."""

@@ -16,7 +16,7 @@ from operators.navigation.costmap import CELL, COARSE, FREE, UNKNOWN, Costmap
 from operators.navigation.distance import MOST_CELLS, distance_to
 from operators.navigation.footprint import Footprint
 from operators.navigation.lattice import Box, Lattice, lattice_around, moved, resampled, union
-from operators.navigation.search import DIAGONAL, KNIGHT, MOVES, STRAIGHT, UNIT, UNREACHED, cost_to_go, trace
+from operators.navigation.search import BLOCKED, DIAGONAL, KNIGHT, MOVES, STRAIGHT, UNIT, UNREACHED, cost_to_go, trace
 
 places = st.floats(-50.0, 50.0)
 
@@ -243,6 +243,20 @@ def test_unseen_floor_that_stops_the_robot_is_taken_for_an_obstacle():
     assert len(x) > 300
     assert x.max() < 0.0
     assert np.hypot(x - 0.2, y - 3.0).max() < 1.1
+
+
+def test_what_stands_at_places_is_in_the_way_there_and_nowhere_else():
+    costmap = Costmap(lethal=0.2, inflation=0.8)
+    costmap.set_map(walled_map(0.9), (0.0, 0.0), CELL)
+    costmap.weights((1.0, 1.0))
+    places = np.array([[1.31, 4.02], [-3.49, 1.0], [1.33, 4.04]])
+    costmap.stand(places)
+    x, y = costmap.lattice.centre(*np.nonzero(costmap.obstacles.filled))
+    assert np.allclose(np.stack([x, y], axis=1), [[-3.475, 1.025], [1.325, 4.025]])
+    weights, coarse = costmap.weights((1.0, 1.0)), costmap.lattice.coarse(2)
+    assert all(weights[coarse.cell(*place)] == BLOCKED for place in places)
+    costmap.stand(np.zeros((0, 2)))
+    assert costmap.obstacles.filled.sum() == 2
 
 
 def test_floor_under_the_robot_is_free():

@@ -151,7 +151,7 @@ def drive_limits_hold(tour):
 
 
 def test_ports_come_in_the_order_of_the_graph():
-    assert list(ports_of(Planner).inputs) == ["goal", "map", "obstacles", "people", "tracks", "pose"]
+    assert list(ports_of(Planner).inputs) == ["goal", "map", "obstacles", "people", "things", "tracks", "pose"]
     assert list(ports_of(Planner).outputs) == ["drive", "plan"]
 
 
@@ -331,6 +331,27 @@ def test_frame_before_its_pose_waits_for_it():
     costmap = planner.navigator.costmap
     x, _ = costmap.lattice.centre(*np.nonzero(costmap.obstacles.filled))
     assert np.abs(x - 3.0).max() < 0.05
+
+
+def beside_a_leaf(*, told):
+    """Turn towards a goal behind, a door's leaf beside the robot that no frame has shown; return the least room."""
+    leaf = wall(3.6, 4.225, 4.4, 4.265)
+    tour = Tour(Building([*ROOM, leaf], [4.0, 4.0, 0.0]), [[2.0, 4.5]])
+    xs = np.linspace(3.6, 4.4, 60)
+    seen = np.stack([xs, np.full(60, 4.23), np.full(60, 0.5)], axis=1)
+    for _ in range(80):
+        if told:
+            x, y, yaw = tour.building.pose
+            points = transform(inverse(planar(x, y, yaw) @ BASE_FROM_LIDAR), seen).astype(np.float32)
+            stamp = tour.period * PERIOD
+            tour.planner.on_things(PointCloud(measured_at=stamp, points=points, base_from_lidar=BASE_FROM_LIDAR))
+        tour.step()
+    return tour.building.least_room
+
+
+def test_what_stands_beside_the_robot_is_not_turned_into():
+    assert beside_a_leaf(told=False) == 0.0
+    assert beside_a_leaf(told=True) > 0.04
 
 
 def hidden_after(people_reach, *, told=True, blind=1.15):

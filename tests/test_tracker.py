@@ -187,6 +187,7 @@ def messages(steps=20):
 
 def test_operator_speaks_of_the_world_at_each_pose():
     assert list(ports_of(Tracker).inputs) == ["people", "near", "obstacles", "pose"]
+    assert list(ports_of(Tracker).outputs) == ["tracks", "things"]
     tracker = Tracker()
     for people, pose in messages():
         tracker.on_people(people)
@@ -279,6 +280,26 @@ def test_things_beside_the_robot_are_nobody():
         counts.append(len(said.identity))
     assert counts[0] == 0
     assert counts[1] > 0
+
+
+def test_what_is_flat_beside_the_robot_goes_out_as_the_sensor_saw_it():
+    random, tracker, mount = np.random.default_rng(2), Tracker(), MOUNT @ planar(0.1, 0.0, 1.0)
+    leaf = np.stack([random.uniform(-0.5, 0.5, 800), np.full(800, 0.6), random.uniform(0.2, 1.4, 800)], axis=1)
+    for seen in (leaf, body((0.7, 0.0), (0.0, 0.0), random, 400)):
+        cloud = PointCloud(
+            measured_at=0, points=transform(inverse(mount), seen).astype(np.float32), base_from_lidar=mount
+        )
+        nothing = PointCloud(measured_at=0, points=np.zeros((0, 3), np.float32), base_from_lidar=MOUNT)
+        for listen, said in ((tracker.on_people, nothing), (tracker.on_obstacles, nothing), (tracker.on_near, cloud)):
+            listen(said)
+        things = tracker.on_pose(Pose(measured_at=0, world_from_base=planar(3.0, -1.0, 2.0))).things
+        assert things.measured_at == 0
+        back = transform(things.base_from_lidar, things.points.astype(np.float64))
+        if seen is leaf:
+            assert len(back) > 700
+            assert np.abs(back[:, 1] - 0.6).max() < 1e-4
+        else:
+            assert len(back) == 0
 
 
 def test_a_frame_of_the_second_sensor_that_never_comes_is_done_without():

@@ -144,6 +144,18 @@ class Costmap:
         self.cover((float(world_from_lidar[0, 3]), float(world_from_lidar[1, 3])))
         self._stale = self._stale.joined(self.obstacles.observe(points, world_from_lidar, floor))
 
+    def stand(self, places: npt.NDArray[np.float64]) -> None:
+        """Enter that something stands at places (n, 2; metres), until the lidar looks through them."""
+        if len(places) == 0:
+            return
+        low, high = places.min(axis=0), places.max(axis=0)
+        self.cover((float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
+        row, column = np.floor(places.T[::-1] / CELL).astype(np.int64)
+        rows, columns = row - self.lattice.first_row, column - self.lattice.first_column
+        self.obstacles.fill(rows, columns)
+        changed = Box(int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1)
+        self._stale = self._stale.joined(changed)
+
     def clear_footprint(self, footprint: Footprint, pose: tuple[float, float, float]) -> None:
         """Empty what seems to stand where the robot (x, y, yaw) itself stands."""
         row, column = self.lattice.cell(pose[0], pose[1])

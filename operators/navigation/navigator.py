@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from graph.geometry import Matrix, wrap, yaw
+from graph.geometry import Matrix, transform, wrap, yaw
 from operators.navigation.costmap import CELL, COARSE, FREE, Costmap
 from operators.navigation.footprint import Footprint, Surroundings
 from operators.navigation.lattice import Lattice
@@ -122,6 +122,10 @@ class Navigator:
     def observe(self, points: npt.NDArray[np.float32], world_from_base: Matrix, base_from_lidar: Matrix) -> None:
         """Enter a frame: points (n, 3) in the lidar frame, and where the base was when it was taken."""
         self.costmap.observe(points, world_from_base @ base_from_lidar, float(world_from_base[2, 3]))
+
+    def stand(self, points: npt.NDArray[np.float32], world_from_sensor: Matrix) -> None:
+        """Enter what stands beside the robot: points (n, 3) of another sensor, in its frame, and where that was."""
+        self.costmap.stand(transform(world_from_sensor, points.astype(np.float64))[:, :2])
 
     def meet(self, walkers: Walkers) -> None:
         """Keep clear of people (k, 4) from now on: x, y, metres and m/s, world, when a command takes effect."""

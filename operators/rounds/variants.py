@@ -85,7 +85,8 @@ def with_labels(graph: Graph, labels: str, *, weights: str | None, threads: int 
 def without_tracker(graph: Graph) -> None:
     """Take the tracker out of a graph, if it is there."""
     graph["operators"].pop("tracker", None)
-    graph["operators"].get("planner", {"inputs": {}})["inputs"].pop("tracks", None)
+    for port in ("tracks", "things"):
+        graph["operators"].get("planner", {"inputs": {}})["inputs"].pop(port, None)
 
 
 def listening_graph(
