@@ -16,12 +16,7 @@ from operators.navigation.lattice import Lattice
 from operators.navigation.motion import Twist, advance, towards
 from operators.navigation.people import (
     AHEAD,
-    BELIEVED,
     BODY,
-    COMES,
-    COMING,
-    COMING_COST,
-    COMING_ROOM,
     EASY,
     HASTY,
     KEPT,
@@ -37,7 +32,6 @@ from operators.navigation.people import (
     crowd,
     nearby,
     person_room,
-    surcharge,
     toll,
 )
 from operators.navigation.search import cost_to_go
@@ -240,10 +234,9 @@ def test_nobody_who_stands_is_driven_into(ahead):
 
 
 @pytest.mark.parametrize("speed", [0.5, 0.8])
-@pytest.mark.parametrize("ahead", [0.8, 0.95])
-def test_robot_gives_way_to_who_comes_towards_it(ahead, speed):
-    choice = choose([[ahead, 0.0, -speed, 0.0]])
-    assert choice.target.linear < 0.0 or abs(choice.target.angular) > 0.3
+@pytest.mark.parametrize("ahead", [0.6, 0.8])
+def test_robot_stands_while_somebody_comes_towards_it(ahead, speed):
+    assert choose([[ahead, 0.0, -speed, 0.0]]).target.linear <= 0.0
     assert choose(NOBODY).target.linear > 1.0
 
 
@@ -265,22 +258,3 @@ def test_costmap_tells_what_stands_near():
     cells[40, 50] = cells[40, 75] = 100
     costmap.set_map(cells, (-2.0, -2.0), 0.05)
     assert costmap.standing(0.0, 0.0, 1.0) == pytest.approx(np.array([[0.525, 0.025]]))
-
-
-@given(walkers, numbers, numbers, st.floats(0.0, 2.0), st.floats(-math.pi, math.pi), st.floats(-0.6, 1.3))
-@settings(max_examples=100, deadline=None)
-def test_surcharge_is_what_misses_at_the_closest(people, x, y, seconds, yaw, speed):
-    soon, met, sure = 0.0, 0.0, COMING_COST * max(0.0, 1.0 - seconds / BELIEVED)
-    for row in people:
-        pace = float(np.hypot(*row[2:]))
-        if pace < COMES:
-            continue
-        reach = BODY + STRIDE * min(1.0, pace / WALK) + RADIUS + COMING_ROOM
-        times = np.linspace(0.0, COMING, 801)[:, None]
-        away = row[:2] + seconds * row[2:] - (x, y)
-        away = np.hypot(*(away + times * (row[2:] - speed * np.array([math.cos(yaw), math.sin(yaw)]))).T)
-        met = max(met, reach - away[0])
-        soon = max(soon, reach - away.min() if away.argmin() > 0 else 0.0)
-    found = surcharge(people, RADIUS, seconds, x, y, yaw, speed)
-    assert found[1] == pytest.approx(sure * met, abs=1e-6)
-    assert max(found) == pytest.approx(sure * max(soon, met), abs=2e-2)

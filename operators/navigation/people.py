@@ -1,8 +1,7 @@
 """People who walk: where they will be when the robot gets there, and how much room they leave it.
 
 A person is a disc, drawn out by its stride, that goes on at constant velocity or stops; with less and less said by that
-as time passes. Nobody is driven into, who makes way is followed as fast as they leave, passing close costs time, and
-where somebody comes the robot is better elsewhere.
+as time passes. Nobody is driven into, who makes way is followed as fast as they leave, and passing close costs time.
 """
 
 from __future__ import annotations
@@ -37,10 +36,6 @@ RETREAT = 0.3  # of that while the robot makes off
 GENTLE, SPEED_PER_METRE = 0.45, 2.5  # m/s towards somebody with no room, and m/s more for each metre of it
 PASSING_SPEED_PER_METRE = 4.0  # the same for who passes somebody
 HURRY_COST = 4.0  # seconds a second, at twice the speed that the room allows
-COMING = 0.6  # seconds within which who comes towards a robot makes it give way
-COMES = 0.4  # m/s from which somebody walks
-COMING_ROOM = 0.1  # metres that shall be left then
-COMING_COST = 8.0  # seconds for each metre of it that is missing
 CROWDED = 8  # weight, besides the 8 of open floor, of a cell where somebody stands, falling with the distance squared
 YIELDED = 0.3  # share of that on the way that the robot is on
 OURS = 2  # cells to each side of it
@@ -133,34 +128,6 @@ def toll(
         cost += HURRY_COST * max(0.0, towards / (GENTLE + SPEED_PER_METRE * room) - 1.0)
     cost += HURRY_COST * max(0.0, pace / (GENTLE + PASSING_SPEED_PER_METRE * room) - 1.0)
     return sure * cost, False
-
-
-@njit(cache=True)
-def surcharge(
-    walkers: Walkers, radius: float, seconds: float, x: float, y: float, yaw: float, speed: float
-) -> tuple[float, float]:
-    """Return what it costs, in seconds, to drive in some seconds where somebody walks, soon after and by then.
-
-    radius: of the robot's outline circle, metres; speed: m/s, forward. The first counts the closest that anyone gets
-    within COMING seconds more if both go on as they do, the second the present distance alone.
-    """
-    missing, missing_now = 0.0, 0.0
-    for index in range(len(walkers)):
-        along, across = walkers[index, 2], walkers[index, 3]
-        pace = math.sqrt(along * along + across * across)
-        if pace < COMES:
-            continue
-        ahead, aside = walkers[index, 0] + seconds * along - x, walkers[index, 1] + seconds * across - y
-        reach = BODY + STRIDE * min(1.0, pace / WALK) + radius + COMING_ROOM
-        missing_now = max(missing_now, reach - math.sqrt(ahead * ahead + aside * aside))
-        along, across = along - speed * math.cos(yaw), across - speed * math.sin(yaw)
-        square = max(along * along + across * across, 1e-6)
-        closest = min(-(ahead * along + aside * across) / square, COMING)
-        if closest > 0.0:
-            ahead, aside = ahead + closest * along, aside + closest * across
-            missing = max(missing, reach - math.sqrt(ahead * ahead + aside * aside))
-    sure = COMING_COST * max(0.0, 1.0 - seconds / BELIEVED)
-    return sure * missing, sure * missing_now
 
 
 @njit(cache=True)

@@ -17,7 +17,7 @@ from numba import njit
 from operators.navigation.footprint import Body, Footprint, Surroundings, room
 from operators.navigation.lattice import Lattice
 from operators.navigation.motion import Twist, advance, paced, towards
-from operators.navigation.people import NOBODY, Walkers, nearby, surcharge, toll
+from operators.navigation.people import NOBODY, Walkers, nearby, toll
 from operators.navigation.search import UNREACHED, Field
 
 STEP = 0.1  # seconds between the poses of an arc: one period of the controller
@@ -140,10 +140,9 @@ def _roll(
     padding: float,
     walkers: Walkers,
     tolls: npt.NDArray[np.float64],
-    surcharges: npt.NDArray[np.float64],
 ) -> int:
     """Fill in poses (steps + 1, 3) and the rest (steps + 1,); return the last step before a touch."""
-    speed, turn, worst = speeds[0], turns[0], 0.0
+    speed, turn = speeds[0], turns[0]
     for k in range(1, len(poses)):
         speed = paced(speed, wanted[0], limits.acceleration * STEP, limits.braking * STEP)
         turn = towards(turn, wanted[1], limits.turn_acceleration * STEP)
@@ -157,9 +156,6 @@ def _roll(
             tolls[k], into = toll(walkers, body.half, k * STEP, (x, y, yaw), speed, turn, limits.speed)
             if into and abs(speed) > abs(speeds[k - 1]) - 0.9 * limits.braking * STEP:  # and does not brake
                 return k - 1
-            soon, met = surcharge(walkers, body.circumscribed, k * STEP, x, y, yaw, speed)
-            worst = max(worst, met)
-            surcharges[k] = max(soon, worst)
     return len(poses) - 1
 
 
@@ -170,7 +166,6 @@ def _judge(
     turns: npt.NDArray[np.float64],
     rooms: npt.NDArray[np.float64],
     tolls: npt.NDArray[np.float64],
-    surcharges: npt.NDArray[np.float64],
     free: int,
     limits: Limits,
     way: Way,
@@ -197,7 +192,7 @@ def _judge(
         column = math.floor((poses[k, 0] - way.x) / way.resolution)
         if row < 0 or row >= way.seconds.shape[0] or column < 0 or column >= way.seconds.shape[1]:
             break
-        total = spent + seconds_left(way, poses[k, 0], poses[k, 1]) + surcharges[k]
+        total = spent + seconds_left(way, poses[k, 0], poses[k, 1])
         missing = limits.speed - speeds[k]  # what is still to be gained costs the time that it takes
         total += missing * missing / (2.0 * limits.acceleration * limits.speed)
         ahead = float(way.direction[row, column])
@@ -230,8 +225,7 @@ def _choose(
     walkers: Walkers,
 ) -> tuple[float, float, float, npt.NDArray[np.float64]]:
     poses = np.empty((steps + 1, 3))
-    speeds, turns, rooms = np.empty(steps + 1), np.empty(steps + 1), np.empty(steps + 1)
-    paid = np.zeros(steps + 1), np.zeros(steps + 1)  # to people: on the way, and on arrival
+    speeds, turns, rooms, tolls = np.empty(steps + 1), np.empty(steps + 1), np.empty(steps + 1), np.zeros(steps + 1)
     poses[0, 0], poses[0, 1], poses[0, 2] = start
     speeds[0], turns[0] = speed_now, turn_now
     here = room(around, body, COMFORT, start[0], start[1], start[2])
@@ -241,8 +235,8 @@ def _choose(
     for i in range(len(speeds_wanted)):
         for j in range(len(turns_wanted)):
             wanted = (speeds_wanted[i], turns_wanted[j])
-            free = _roll(poses, speeds, turns, rooms, wanted, limits, around, body, needed, walkers, *paid)
-            total, at = _judge(poses, speeds, turns, rooms, *paid, free, limits, way)
+            free = _roll(poses, speeds, turns, rooms, wanted, limits, around, body, needed, walkers, tolls)
+            total, at = _judge(poses, speeds, turns, rooms, tolls, free, limits, way)
             total += SWERVE_COST * abs(turns_wanted[j] - turn_before)
             if total < best:
                 best, best_speed, best_turn = total, wanted[0], wanted[1]
