@@ -18,19 +18,22 @@ from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from graph.contract import Operator
-from graph.geometry import Matrix, interpolate, planar
+from graph.geometry import Matrix, interpolate, planar, transform
 from graph.messages import Drive, Goal, OccupancyGrid, Plan, PointCloud, Pose, Tracks
 from operators.navigation.footprint import Footprint
 from operators.navigation.navigator import Navigator
-from operators.navigation.people import NOBODY, Walkers
+from operators.navigation.people import NOBODY, Walkers, apart
 from operators.navigation.presence import BLIND, Presence
 from operators.navigation.window import Limits
 from operators.pointmap.rehearsal import room_scan
 
 HISTORY = 50  # poses kept, to find where a frame was taken
 WAITING = 10  # frames kept until the pose of their time is known
+THEIRS = 0.32  # metres from the middle of a person, as a tracker says it, within which all that is seen is theirs
+JUST_NOW = 0.25  # seconds: whoever was seen since
 
 
 class Planner(Operator):
@@ -138,7 +141,10 @@ class Planner(Operator):
             frame = self._frames.popleft()
             where = self._pose_at(frame.measured_at)
             if where is not None:
-                self.navigator.observe(frame.points, where, frame.base_from_lidar)
+                points = frame.points
+                if self._tracks is not None and self.config.people == "predict":
+                    points = self._nobodys(frame, where @ frame.base_from_lidar, self._tracks)
+                self.navigator.observe(points, where, frame.base_from_lidar)
                 if self.config.people == "predict" and (self._tracks is None or self._tracks.blind > 0.0):
                     things = self.navigator.costmap.standing(float(where[0, 3]), float(where[1, 3]), BLIND)
                     people = [other.points for other in self._people if other.measured_at == frame.measured_at]
@@ -161,6 +167,13 @@ class Planner(Operator):
             status=decision.status,
         )
         return self.Outputs(drive=drive, plan=plan)
+
+    def _nobodys(self, frame: PointCloud, world_from_lidar: Matrix, tracks: Tracks) -> npt.NDArray[np.float32]:
+        """Return the points (m, 3; lidar frame) but those at people: parts of them pass for things now and then."""
+        seconds = (frame.measured_at - tracks.measured_at) * 1e-9
+        places = (tracks.position + seconds * tracks.velocity)[tracks.unseen < JUST_NOW]
+        floor = transform(world_from_lidar, frame.points.astype(np.float64))[:, :2]
+        return frame.points[apart(floor, places, THEIRS)]
 
     def _walkers(self, time: int) -> Walkers:
         """Return the people (k, 4) that are followed, at the moment when the command for a pose takes effect."""

@@ -29,6 +29,7 @@ from operators.navigation.people import (
     STUBBORN,
     WALK,
     Stubborn,
+    apart,
     crowd,
     nearby,
     person_room,
@@ -258,3 +259,10 @@ def test_costmap_tells_what_stands_near():
     cells[40, 50] = cells[40, 75] = 100
     costmap.set_map(cells, (-2.0, -2.0), 0.05)
     assert costmap.standing(0.0, 0.0, 1.0) == pytest.approx(np.array([[0.525, 0.025]]))
+
+
+@given(walkers, walkers, st.floats(0.01, 2.0))
+@settings(max_examples=50, deadline=None)
+def test_points_at_nobody_are_those_outside_all_circles(points, people, radius):
+    away = np.hypot(*(points[:, None, :2] - people[None, :, :2]).transpose(2, 0, 1))
+    assert np.array_equal(apart(points[:, :2], people[:, :2], radius), (away >= radius).all(axis=1))

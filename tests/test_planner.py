@@ -354,6 +354,28 @@ def test_what_stands_beside_the_robot_is_not_turned_into():
     assert beside_a_leaf(told=True) > 0.04
 
 
+@pytest.mark.parametrize(("mode", "unseen", "struck"), [("predict", 0.0, 1), ("predict", 0.5, 2), ("ignore", 0.0, 2)])
+def test_what_is_seen_at_somebody_is_theirs(mode, unseen, struck):
+    """Two posts, one where a tracker has just seen somebody, who walks: it is their leg, labelled as a thing."""
+    planner = Planner(Planner.Config(people=mode))
+    planner.on_goal(Goal(measured_at=0, target=np.array([6.0, 0.0]), index=0, count=1))
+    planner.on_tracks(
+        Tracks(
+            measured_at=0,
+            identity=np.ones(1, np.int32),
+            position=np.array([[2.0, 1.0]]),
+            velocity=np.array([[0.0, 1.0]]),
+            unseen=np.array([unseen], np.float32),
+            blind=0.0,
+        )
+    )
+    points = np.array([[2.02, 1.33, -0.2], [2.02, -1.2, -0.2]], np.float32)
+    planner.on_pose(Pose(measured_at=0, world_from_base=planar(0.0, 0.0, 0.0)))
+    planner.on_obstacles(PointCloud(measured_at=PERIOD, points=points, base_from_lidar=BASE_FROM_LIDAR))
+    planner.on_pose(Pose(measured_at=PERIOD, world_from_base=planar(0.0, 0.0, 0.0)))
+    assert planner.navigator.costmap.obstacles.filled.sum() == struck
+
+
 def hidden_after(people_reach, *, told=True, blind=1.15):
     """Show a planner a person at a distance, its echoes kept only beyond the ring; return whom it keeps clear of."""
     planner = Planner(Planner.Config(people="predict"))

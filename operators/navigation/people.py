@@ -198,3 +198,15 @@ def nearby(walkers: Walkers, x: float, y: float, reach: float) -> Walkers:
     """Return those within reach metres of a place, in their order."""
     away = np.hypot(walkers[:, 0] - x, walkers[:, 1] - y)
     return np.ascontiguousarray(walkers[away < reach])
+
+
+@njit(cache=True)
+def apart(points: npt.NDArray[np.float64], places: npt.NDArray[np.float64], radius: float) -> Flags:
+    """Say which of the points (n, 2) are farther than `radius` from each of the places (k, 2), metres."""
+    result = np.ones(len(points), np.bool_)
+    for i in range(len(points)):
+        for j in range(len(places)):
+            if (points[i, 0] - places[j, 0]) ** 2 + (points[i, 1] - places[j, 1]) ** 2 < radius * radius:
+                result[i] = False
+                break
+    return result
