@@ -376,6 +376,29 @@ def test_what_is_seen_at_somebody_is_theirs(mode, unseen, struck):
     assert planner.navigator.costmap.obstacles.filled.sum() == struck
 
 
+def test_robot_hemmed_in_from_behind_gets_out_ahead():
+    """People beside and behind who do not move, nobody before it: it cannot turn towards its goal where it stands."""
+    around = [(0.45, 104.0), (0.68, -144.0), (0.86, 157.0), (0.95, 75.0), (1.0, -66.0), (1.05, -22.0), (0.8, -110.0)]
+    people = np.array([[4.0 + r * math.cos(math.radians(b)), 4.0 + r * math.sin(math.radians(b))] for r, b in around])
+    tour = Tour(Building(ROOM, [4.0, 4.0, 0.0]), [[2.0, 2.0]], config=Planner.Config(people="predict", braking=2.5))
+    for _ in range(150):
+        stamp = tour.period * PERIOD
+        tour.planner.on_tracks(
+            Tracks(
+                measured_at=stamp,
+                identity=np.arange(len(people), dtype=np.int32),
+                position=people,
+                velocity=np.zeros_like(people),
+                unseen=np.zeros(len(people), np.float32),
+                blind=0.0,
+            )
+        )
+        tour.step()
+        away = np.hypot(*(people - tour.building.pose[:2]).T)
+        assert away.min() > 0.4
+    assert max(math.dist(pose[:2], (4.0, 4.0)) for pose in tour.poses) > 0.3
+
+
 def hidden_after(people_reach, *, told=True, blind=1.15):
     """Show a planner a person at a distance, its echoes kept only beyond the ring; return whom it keeps clear of."""
     planner = Planner(Planner.Config(people="predict"))

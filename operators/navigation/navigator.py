@@ -14,7 +14,7 @@ from operators.navigation.costmap import CELL, COARSE, FREE, Costmap
 from operators.navigation.footprint import Footprint, Surroundings
 from operators.navigation.lattice import Lattice
 from operators.navigation.motion import Commands, Planar, Progress, Twist, advance, paced, towards
-from operators.navigation.people import NOBODY, Stubborn, Walkers, crowd
+from operators.navigation.people import NOBODY, Stubborn, Walkers, crowd, nearby
 from operators.navigation.search import UNIT, UNREACHED, Field, cost_to_go, trace
 from operators.navigation.window import STEP, DynamicWindow, Limits, way_around
 
@@ -32,6 +32,7 @@ ATTEMPTS = 8  # recoveries within FRESH metres after which a target is called un
 FRESH = 1.0  # metres
 LOOSE = 0.3  # metres from where the robot was wedged
 REST = 200  # periods after which an unreachable target is tried again
+ABOUT = 1.0  # metres within which people may hem the robot in
 CAREFUL_SPEED = 0.4  # m/s at most, while the localizer is not sure
 
 
@@ -47,8 +48,11 @@ class Decision(NamedTuple):
 class Recovery:
     """Motions to get loose with, one after the other; each is left when it would touch something."""
 
-    def __init__(self, attempt: int, turn: float, limits: Limits) -> None:
-        """Plan the motions. attempt: from 0, each does something else; turn: radians to the left to face the way."""
+    def __init__(self, attempt: int, turn: float, limits: Limits, *, crowded: bool = False) -> None:
+        """Plan the motions. attempt: from 0, each does something else; turn: radians to the left to face the way.
+
+        crowded: people are about; with them beside and behind, every other time the way out is ahead.
+        """
         self.moved = False  # whether any of them was possible
         back = Twist(-limits.reverse, 0.0)
         side = math.copysign(0.8 * limits.turn, turn)
@@ -60,6 +64,8 @@ class Recovery:
             [(back, 20), (other, 20)],
             [(Twist(), 20), (back, 8), (spin, 20)],
         ][attempt % 4]
+        if crowded and attempt % 2 == 1:
+            self.motions = [(Twist(limits.reverse, 0.0), 20), (spin, facing)]
 
 
 class Navigator:
@@ -260,7 +266,8 @@ class Navigator:
             self._attempts, self._given_up, self._until_replan = 0, REST, 0
         ahead = self._path[min(6, len(self._path) - 1)] if len(self._path) else np.array(self._goal)
         turn = float(wrap(math.atan2(ahead[1] - pose[1], ahead[0] - pose[0]) - pose[2]))
-        self._recovery = Recovery(self._attempts, turn, self.limits)
+        crowded = len(nearby(self._walkers, pose[0], pose[1], ABOUT)) > 0
+        self._recovery = Recovery(self._attempts, turn, self.limits, crowded=crowded)
         self._attempts += 1
 
     def _get_loose(self, pose: Planar, around: Surroundings) -> Twist | None:
